@@ -9,13 +9,15 @@ E = 1e3  # Pa, of the beam
 THERE = ((2.0, -np.inf), (np.inf, np.inf))
 
 
-def beside(kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, **options) -> mpm.Simulation:
-    """Return the scene; stiffer: what the other body's modulus is in terms of the beam's; law: of the beam."""
+def beside(
+    kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, plate=False, **options
+) -> mpm.Simulation:
+    """Return the scene; stiffer: the other body's modulus over that of the beam; law: of the beam; plate: on it."""
     grid = mpm.Grid([0, 0], [3.6, 1.2], [30, 10])
     soft, hard = (mpm.Hencky(bulk=f * E / 1.8, shear=f * E / 2.6, conductivity=1e-4) for f in (1, stiffer))
     bodies, materials = [mpm.box(grid, [0, 0.42], [1, 0.75])], [law or soft]
     at_beam = ((0.05, -np.inf), (1.01, np.inf))
-    loads = [mpm.Traction("top", lambda t: (0, -t), region=at_beam)]
+    loads = [mpm.RigidPlate("top", lambda t: t, at_beam) if plate else mpm.Traction("top", lambda t: (0, -t), at_beam)]
     drained = [mpm.Drained("right", region=((-np.inf, -np.inf), (1.01, np.inf)))]
     if kind:
         bodies.append(mpm.box(grid, [2.52, 0.3], [3.0, 0.78], material=1))

@@ -47,6 +47,7 @@ QUICK = {
     "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "landslide": ("--cells 4 --dt 0.2", ["landslide.png"]),
+    "falling": ("--cells 3 --dt 0.02", ["falling.png"]),
     "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
     "drainage": ("--cells 10 --step 120", ["drainage.png"]),
     "rain": ("--cells 10 --step 7200", ["rain.png"]),
@@ -63,7 +64,7 @@ QUICK = {
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
 # what they show has tests of its own, or takes long to compile
-LONG = {"slump", "cavity", "footing", "slope", "image", "landslide", "vibration", "wave"}
+LONG = {"slump", "cavity", "footing", "slope", "image", "falling", "landslide", "vibration", "wave"}
 
 
 def run(demo, arguments):

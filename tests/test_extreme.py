@@ -81,6 +81,14 @@ def test_time_steps_of_any_size_give_the_layers_consolidation(dt):
     assert case("time-step", f"dt = {dt:.0e} s").outcome == "converged"
 
 
+@pytest.mark.parametrize("k", ["1e-12", "1e-01"])
+@pytest.mark.parametrize(
+    ("steep", "ends"), [("1e-03", {"converged"}), ("1e+01", {"converged"}), ("1e+03", {"refused"})]
+)
+def test_rain_on_soil_of_any_retention_is_exact_or_refused(k, steep, ends):
+    assert case("rain", f"k = {k} m/s, alpha h = {steep}").outcome in ends
+
+
 @pytest.mark.parametrize("nu", [0.0, 0.499])
 def test_water_that_flows_freely_costs_an_iteration_a_substep_at_most(nu):
     truth = {"truth": (80, 32) if nu else (40, 16)}

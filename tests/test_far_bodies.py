@@ -15,10 +15,10 @@ CLAY = mpm.DruckerPrager(bulk=E / 1.8, shear=E / 2.6, friction=20.0, dilation=0.
 
 
 @cache
-def after(kind, stiffer=1.0, wet=False, law=None, steps=2):
+def after(kind, stiffer=1.0, wet=False, law=None, steps=2, plate=False):
     """Return displacements, stresses and pressures of the beam after some steps, and the residuals that these told."""
     options = {} if law is None else {"numerics": mpm.Numerics(tolerance=1e-10)}  # far below what is compared
-    s = beside(kind, stiffer, wet, law, **options)
+    s = beside(kind, stiffer, wet, law, plate, **options)
     n, start = len(s.bodies[0]), s.points.x
     told = [s.step(1.0).history[-1] for _ in range(steps)]
     points = s.points
@@ -41,6 +41,11 @@ def test_a_body_at_rest_however_stiff_changes_nothing_and_hides_no_residual(stif
 @pytest.mark.parametrize("stiffer", [1.0, 1e10])
 def test_what_a_far_body_does_changes_nothing(kind, stiffer):
     assert off(after(kind, stiffer)[0], after(None)[0]) < 1e-11
+
+
+def test_a_plate_is_rigid_beside_what_it_lies_on():
+    """It was beside the stiffest body of the scene: a far one changed its answer, and no step was found."""
+    assert off(after("rests", 1e10, plate=True)[0], after(None, plate=True)[0]) < 1e-11
 
 
 @pytest.mark.parametrize(("kind", "stiffer"), [("rests", 1e10), ("moves", 1e8), ("drains", 1.0), ("drains", 1e6)])

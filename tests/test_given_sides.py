@@ -263,3 +263,16 @@ def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
     s = mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, conditions=[press])
     moved = s.run(1.0, 1.0, probes=mpm.probes([body], [[0.2, 1.0]]), progress=False).displacement[-1][0, 1]
     assert -moved == pytest.approx(1e-3, rel=1e-2 if fluid else 1e-3)
+
+
+@pytest.mark.parametrize(("bulk", "shear"), [(np.inf, 1e6), (2.2e9, 1e3)])
+def test_a_side_that_has_no_room_for_its_way_is_refused(bulk, shear):
+    """Sealed water under it bore 200 GPa, and the side stayed where it was without a word."""
+    grid = mpm.Grid([0, 0], [0.5, 1.5], [5, 15])
+    soil = mpm.Hencky(bulk=2 * shear, shear=shear, conductivity=1e-5)
+    press = mpm.Displacement("top", lambda t, X: (0, -0.01 * t), "y")
+    walls = {"bottom": "y", "left": "x", "right": "x"}
+    bodies = [mpm.box(grid, [0, 0], [0.5, 1.0])]
+    s = mpm.Simulation(grid, bodies, [soil], fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=[press])
+    with pytest.raises(mpm.GaveUp, match=r"come \d+% of the way that is given at most, must have room"):
+        s.run(1.0, 0.5, progress=False)

@@ -329,7 +329,10 @@ def test_a_resumed_flight_has_the_same_bits(tmp_path):
         ({"inertia": True, "velocity": (1, 0, 0)}, "velocity"),
         ({"inertia": True, "velocity": lambda X: X}, "velocity"),
         ({"inertia": True, "numerics": mpm.Numerics(quadrature="point")}, "quadrature"),
-        ({"inertia": True, "conditions": [mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), friction=0.3)]}, "friction"),
+        (
+            {"inertia": True, "conditions": [mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), load=1.0, direction=(0, -1))]},
+            "no mass",
+        ),
     ],
 )
 def test_what_is_no_inertia_is_refused(options, names):

@@ -26,7 +26,7 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids".split()
+NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike".split()
 SCENES = [f"mpi_{name}.py" for name in NAMES]
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import mpi_renewal
 import numpy as np
+import penetration as demo
 import pytest
 from test_mpi import mpirun
 
@@ -131,6 +132,35 @@ def test_pressures_act_on_renewed_sides_as_before(monkeypatch):
         moment = [(p.X[:, 0] * a[:, 1]).sum() for p, a in zip(patches, area, strict=True)]
         found.append([*np.sum(area[0], axis=0), *moment, *(p.area0.sum() for p in patches)])
     assert count and found[1] == pytest.approx(found[0], rel=2e-3, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("alpha", "depth"), [(0.5, 1.25), (1.0, 1.25)])
+def test_clay_from_a_polygon_flows_around_a_bar(alpha, depth):
+    """A T-bar of a diameter of 1 m, 8 cells, in the middle of a block five diameters wide and high.
+
+    Without renewal a half rough one gives up after 0.9 diameters.
+    """
+    wide, strength, h = 2.5, 1e3, 1 / 8
+    grid = mpm.Grid([0, -wide], [wide, wide + 4 * h], [20, 44])
+    angle = np.linspace(np.pi / 2, -np.pi / 2, 33)
+    arc = np.stack([0.5 * np.cos(angle), 0.8 + 0.5 * np.sin(angle)], axis=1)
+    arc[[0, -1], 0] = 0.0
+    outline = np.concatenate([[[0, -wide], [wide, -wide], [wide, wide], [0, wide]], arc])
+    clay = mpm.polygon(grid, outline, ["bottom", "right", "top", "left", *["bar"] * 32, "left"])
+    soil = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=strength)
+    bar = mpm.Tool(mpm.Ball((0, 0.8), 0.5), lambda t: (0, -max(0, t - 1)), adhesion=alpha * strength)
+    load = mpm.Pressure("top", lambda t: 2e4 * min(1, t))
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [clay], [soil], walls=walls, conditions=[load, bar])
+    s.run(1, 1, progress=False)
+    result = s.run(1 + depth, h / 12, progress=False)
+    N = -2 * result.tool_forces["tool"][1:, 1] / strength / demo.exact(alpha)
+    windows = N[-108:].reshape(-1, 12).mean(axis=1)
+    print(f"alpha = {alpha}: {np.round(100 * windows - 100, 2)} %; {result.cuts} of {result.steps} steps cut")
+    assert result.converged and result.renewals > 5 and result.cuts <= 0.1 * result.steps
+    assert windows[-4:] == pytest.approx(1, abs=0.03)
+    assert (N[1:] / N[:-1])[24:].min() > 0.95
 
 
 @pytest.mark.parametrize("processes", [1, 3])

@@ -345,3 +345,42 @@ def units():
     for E in (1.0, 1e3, 1e11, 1e15):
         beam = Beam(soil(E), load=2e-3 * E)
         yield f"{E:.0e} Pa", partial(beside, beam, Beam())
+
+
+@family(1e-4)
+def rain():
+    """Column in rain of half of k, of a tenth of that before, k = 1e-12 ... 1e-1 m/s, alpha h = 1e-3 ... 1e3: heads,
+    exact (Gardner's soil over a water table)."""
+    for k in [*decades(-12, 0, 4), 0.1]:
+        for steep in decades(-3, 3):
+            yield f"k = {k:.0e} m/s, alpha h = {steep:.0e}", partial(rained, k, steep)
+
+
+def rained(k: float, steep: float, cells: int = 10) -> Scene:
+    """Return the column, and a time in which its heads become steady."""
+    h, weight = 1 / cells, 9810.0
+    alpha = steep / h
+    grid = mpm.Grid([0, 0], [h, 1 + 2 * h], [1, cells + 2])
+
+    def steady(share: float, z: np.ndarray) -> np.ndarray:
+        """Return heads, m, in rain of a share of k."""
+        return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
+
+    law = {"porosity": 0.4, "conductivity": k, "retention": mpm.Gardner(weight / alpha)}
+    column = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [h, 1])],
+        [mpm.LinearElastic(bulk=1e9, shear=5e8, **law)],
+        fluid=mpm.Fluid(),
+        gravity=(0, -9.81),
+        walls={"left": "x", "right": "x", "bottom": "y"},
+        conditions=[mpm.Drained("bottom"), mpm.Rain("top", k / 2, name="rain")],
+        pressure=lambda x: weight * steady(0.05, x[:, 1]),
+        initial_stress=mpm.K0(0.5),
+    )
+
+    def error(s: mpm.Simulation, result: mpm.Result) -> float:
+        cell = s.cells()
+        return off(cell.pressure / weight, steady(0.5, cell.x[:, 1]))
+
+    return Scene(column, 100 / k, 20, error)

@@ -17,7 +17,8 @@ class Report:
     the next step may be longer; error, change, extremes: estimated error, and largest change, of the cells' pressures
     in the step, and the least and the largest of them, Pa; sealed: largest change had no fluid flowed, Pa; first:
     change in the first substep, Pa; sudden: the same where it is so fast that the step may overshoot, Pa; stress: what
-    forces of the nodes stand for, Pa; moves: estimated error of the motion, and the motion, see `motion_error`.
+    forces of the nodes stand for, Pa; moves: estimated error of the motion, and the motion, see `motion_error`; fills:
+    estimated error of the water content, and its largest change, of pores that drain.
     """
 
     newton: int = 0
@@ -35,6 +36,7 @@ class Report:
     sudden: float = 0.0
     stress: float = 0.0
     moves: tuple[float, float] = (0.0, 0.0)
+    fills: tuple[float, float] = (0.0, 0.0)
 
 
 class StepFailed(RuntimeError):

@@ -110,6 +110,14 @@ class Place(NamedTuple):
     inertia: bool = False
 
 
+class Shares(NamedTuple):
+    """Shares own and before of a substep in its step, s, see `Substep`; gravity (d,) in it, m/s^2, if there is any."""
+
+    own: float
+    before: float
+    gravity: NDArray[np.float64] | None
+
+
 class At(NamedTuple):
     """Displacements u of the step, a local array, m, and which of them are unknowns."""
 
@@ -144,6 +152,20 @@ class Loads:
     """Whether bodies may part from it."""
     key: Any = None
     """What the penalty depends on beside the places of faces."""
+
+    def begun(self, shares: Shares, gone: Any) -> Loads:
+        """Return the same in a substep of bodies with inertia; gone: what `flown` returned of the last one."""
+        return self
+
+    def flown(self, at: At) -> Any:
+        """Return what the next substep of bodies with inertia needs of this one, which has been solved, at u."""
+
+    def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
+        """Return powers at u on this process, W: what slip on it takes, and what it brings beside `push`.
+
+        v: velocities, a local array, m/s.
+        """
+        return 0.0, 0.0
 
     def dead(self, b: NDArray[np.float64]) -> None:
         """Add the forces on the bodies that stay through the substep."""

@@ -319,6 +319,8 @@ class Rain(Flux):
     Rain soaks in until the pressure at the side is that of `ponding`: what soil does not take then runs off.  Water
     evaporates until the pressure is `driest`.  What seeps out of the body leaves it too.  What passes the side is in
     the simulation's `outflows`, and what runs off in `simulation.outcome("runoff")`, m^3/s (m^2/s in plane strain).
+    Volumes since the condition began, m^3 (m^2): `outcome("flowed")` out of the body, also through other open sides,
+    `outcome("ran_off")`, what seeps out here included, and what stands on the side, `outcome("ponded")`.
 
     Parameters
     ----------
@@ -328,8 +330,8 @@ class Rain(Flux):
         Rain that falls on the present area of the side in a time, as a volume at zero pressure, finite; negative: what
         would evaporate from a wet side.  Rain that falls straight down on a slope of angle b has flux cos(b).
     ponding
-        Pressure of the water that stands on the side before it runs off, Pa, >= 0: its depth times its weight.  The
-        volume of the pond is not counted.
+        Pressure of the water that stands on the side before it runs off, Pa, >= 0: its depth times its weight.  One
+        pond, of the same depth all over the side, fills before anything runs off, and later soaks in or evaporates.
     driest
         Least pressure at the side, Pa, < 0 and finite: the suction of the air.  By Kelvin's equation -1e7 Pa is in
         balance with air of 93 % humidity at 20 °C.

@@ -9,10 +9,11 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Shares
+from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import Contacts
-from mpm_dolfinx.contact.problem import ContactProblem
+from mpm_dolfinx.contact.problem import ContactProblem, Gone
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.contact.tool_placing import NEAR, Tools, Ways
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -68,18 +69,33 @@ class ToolsOfStage(Touching):
         self.outside = found.faces
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments of this value, and that no load has pushed them."""
-        return super().unknown(value) | {"tool_travel": self.by_name(np.zeros(len(self.names)))}
+        """Return forces and moments of this value, and that nothing has pushed them."""
+        out, d = super().unknown(value), self._grid.dim
+        tools = dict(zip(self.names, self.found.tools, strict=True))
+        out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
+        if self.found.free:
+            out["tool_velocity"] = {name: tool.begins(d) for name, tool in tools.items() if tool.free}
+        return out
 
     def _ways(self, place: Place) -> NDArray[np.float64]:
-        """Return how far loads had pushed them at the start of a step (tools,), m."""
-        return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
+        """Return how far loads had pushed them at the start of a step (tools,), m; with free tools (tools, d)."""
+        gone = [place.before["tool_travel"][name] for name in self.names]
+        if self.found.free:
+            gone = [np.broadcast_to(way, (self._grid.dim,)) for way in gone]
+        return np.array(gone, dtype=float)
 
     def placed(self, place: Place) -> Loads:
         """Return the contact with them."""
         ways = self._ways(place)
-        tools = self.found.going(Ways(place.start, place.t, ways, ways))
-        return ToolLoads(tools, place.cut, place.points, ways, (place.start, place.t))
+        tools = self.found.going(Ways(place.start, place.t, ways, ways), place.start + place.dt * place.inertia)
+        placed = tools, place.cut, place.points, ways, (place.start, place.t)
+        if not self.found.free:
+            return ToolLoads(*placed)
+        velocity = np.zeros_like(ways)
+        for k, name in enumerate(self.names):
+            velocity[k] = place.before["tool_velocity"].get(name, 0.0)
+        options = {"velocity": velocity, "pushes": self.found.pushes(place.t)}
+        return FreeToolLoads(*placed, mass=self.found.masses, guides=self.found.guides, **options)
 
     def check_start(self, place: Place) -> None:
         """Refuse tools that begin in bodies."""
@@ -130,6 +146,30 @@ class ToolLoads(ContactProblem):
         self._cut = cut
         self._before = before
         self._times = times
+        self.shares, self._gone = Shares(np.inf, 0.0, None), None
+
+    def begun(self, shares: Shares, gone: Gone | None) -> ToolLoads:
+        """See `Loads`."""
+        out = copy(self)
+        out.shares, out._gone = shares, gone
+        return out
+
+    def flown(self, at: At) -> Gone:
+        """See `Loads`."""
+        return Gone(self.shares.own, self.pairs.poses)
+
+    def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
+        """See `ContactProblem`: as the method has it from where the tools are in both substeps."""
+        pairs = self.pairs
+        gone = pairs.carried - pairs.now
+        if self._gone is not None:
+            there = np.zeros_like(gone)
+            for number, pose in enumerate(self._gone.poses):
+                on = pairs.number == number
+                start = self._tools.pose(number, self._times[0])
+                there[on] = pose.put(start.own(pairs.now[on])) - pairs.now[on]
+            gone = gone - self.shares.before / self._gone.own * there
+        return gone / self.shares.own
 
     def ended(self, at: At) -> Loads:
         """Return the contact with the tools as they have gone."""
@@ -151,6 +191,10 @@ class ToolLoads(ContactProblem):
         """Refuse a step in which tools have passed bodies, or after which they are in bodies."""
         start, t = self._times
         self._tools.check_end(self._cut, points, t, before, start)
+
+
+class FreeToolLoads(FreeTools, ToolLoads):
+    """Contact with tools some of which are free."""
 
 
 class ContactLoads(ContactProblem):

@@ -290,8 +290,13 @@ class Contacts:
             Saying where; a shorter step may do.
         """
         h, comm = self.grid.h.min(), self.grid.comm
-        moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0)
-        if 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
+        moved = points.corners - before.corners
+        low, high = (
+            over_all(comm, ends(moved, axis=(0, 1), initial=start), op)
+            for ends, start, op in ((np.min, np.inf, MPI.MIN), (np.max, -np.inf, MPI.MAX))
+        )
+        sizes = [np.linalg.norm(moved - by, axis=2).max(initial=0.0) for by in (0.0, (low + high) / 2)]
+        if 2 * over_all(comm, np.array(sizes), MPI.MAX).min() > REACH * h:
             raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
         if message := self._too_deep(cut, points):
             raise NotConverged(message)

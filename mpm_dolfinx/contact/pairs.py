@@ -62,7 +62,10 @@ class Pairs:
     sign: NDArray[np.float64]
 
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
-        """Return the pairs at w (m, d), m, where loads have pushed tools (contacts,), m, in the step."""
+        """Return the pairs at w (m, d), m, where loads have pushed tools (contacts,), m, in the step.
+
+        travel: (contacts, d), m, where tools are free.
+        """
         raise NotImplementedError
 
     @property
@@ -105,7 +108,8 @@ class ToolPairs(Pairs):
         n = np.zeros((m, d))
         second = np.zeros((m, d, d))
         middle = np.zeros((m, d))
-        gone, x = travel[:, None] * [tool.along(d) for tool in self.tools], self.now + w
+        gone = travel if travel.ndim > 1 else travel[:, None] * [tool.along(d) for tool in self.tools]
+        x = self.now + w
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -88,6 +88,14 @@ class Current(NamedTuple):
     origin: Origin
     state: ContactState
     ways: Ways | None = None
+
+
+class Gone(NamedTuple):
+    """How tools have gone in a substep with the share own, s: their poses, and the flight of free ones."""
+
+    own: float
+    poses: Any
+    flight: Any = None
 
 
 class ContactProblem(Loads):
@@ -187,7 +195,7 @@ class ContactProblem(Loads):
         out = self._pattern_of_pairs(unknowns) if self._reach is not None else None
         for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
-            more = _outer(own, own)
+            more = outer(own, own)
             out = more if out is None else out + more
         if out is not None:
             out.zeroEntries()
@@ -223,7 +231,7 @@ class ContactProblem(Loads):
         for k in np.flatnonzero((slope > 0) & ~np.isnan(self.pushes.load)):
             e = self.pushes.direction[k] * (self.pairs.number == k)[:, None]
             sides = (self._nodal(unknowns, law.slope(touch, where, e, adjoint)) for adjoint in (False, True))
-            K.axpy((SAME - 1) / slope[k], _outer(*sides), PETSc.Mat.Structure.UNKNOWN)
+            K.axpy((SAME - 1) / slope[k], outer(*sides), PETSc.Mat.Structure.UNKNOWN)
         return K
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
@@ -379,6 +387,26 @@ class ContactProblem(Loads):
         contacts = dict(zip(law.names, law.contacts, strict=True))
         return origin.means(contacts, points, *law.tractions(self.found(at).touch))
 
+    def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
+        """See `Loads`: only tools bring work; what sticks takes what bends its elastic hold, and gives it back.
+
+        Pressures do none at the gap: where one closes within a step the velocities of substeps jump.
+        """
+        law = self.now.law
+        found = self.found(at)
+        B, apart = self._B(law, at.unknowns)
+        B.mult(at.unknowns.gather_owned(v[at.unknowns.owned]), apart)
+        moves = apart.array_r.reshape(-1, self.grid.dim)
+        tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
+        shear = law.pairs.area[:, None] * found.touch.shear[law.of]
+        # the part of the nodes' power that `push` has counted is that of the tools
+        more = -float((found.balanced * moves).sum()) + float((found.touch.force * tool).sum())
+        return -float((shear * (moves - tool)).sum()), more
+
+    def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
+        """Return the velocities (m, d), m/s, of the places of tools; nothing where both sides deform."""
+        return 0.0
+
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and how far loads push tools, m."""
         where, touch, travel, _ = self.found(at)
@@ -419,7 +447,7 @@ class ContactProblem(Loads):
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
-def _outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
+def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
     """Return a b^T, of what is not zero."""
     start, comm = b.owner_range[0], b.comm.tompi4py()
     rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)

@@ -63,6 +63,12 @@ class Tool:
         simulation's `tool_travel`.  In axisymmetry the load all around.
     direction : (d,)
         In which a load pushes; of any length; in axisymmetry along the axis.
+    mass
+        Of a free tool, kg (kg/m in plane strain), > 0, beside bodies with inertia: its weight, its load and what it
+        touches move it from `displacement`, along `direction` if there is one, else in any; it does not turn.  How far
+        is in `tool_travel` (d,), m, its velocity in `outcome("tool_velocity")` (d,), m/s.
+    velocity : (d,), m/s
+        Of a free tool, as it begins.
     name
         By which its results are found, and what it has on points, as NAME_pressure; without, "tool".
         A tool of a later stage that is given the same name keeps that.
@@ -81,6 +87,8 @@ class Tool:
     adhesion: float = 0.0
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
+    mass: float | None = None
+    velocity: ArrayLike | None = None
     name: str | None = field(default=None, kw_only=True, repr=False)
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
     _moved: ClassVar[Shape | None] = None
@@ -91,8 +99,9 @@ class Tool:
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
-        if (self.load is None) != (self.direction is None):
+        if (self.load is None) != (self.direction is None) and (self.load is not None or self.mass is None):
             raise ValueError(f"{line(self)}: load and direction, must be given both, or none")
+        self._check_free()
         for name in ("displacement", "rotation_rad", "load"):
             value = getattr(self, name)
             if callable(value):
@@ -101,6 +110,37 @@ class Tool:
                 object.__setattr__(self, name, deepcopy(value))  # nobody changes it
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)
+
+    def _check_free(self) -> None:
+        """Refuse a mass that is none, and what only free tools have, or have not."""
+        if self.mass is None:
+            if self.velocity is not None:
+                raise ValueError(f"{line(self)}: velocity, must be given with a mass")
+            return
+        numbers("Tool: mass", self.mass, test=lambda v: (v > 0) & (v < np.inf), allowed="> 0 and finite")
+        if callable(self.displacement) or callable(self.rotation_rad):
+            raise ValueError(
+                f"{line(self)}: a free tool moves by itself, displacement and rotation_rad must be constant"
+            )
+
+    @property
+    def free(self) -> bool:
+        """Whether forces move the tool."""
+        return self.mass is not None
+
+    def begins(self, dim: int) -> NDArray[np.float64]:
+        """Return the velocity (d,), m/s, with which a free tool begins."""
+        if self.velocity is None:
+            return np.zeros(dim)
+        v = numbers("Tool: velocity", self.velocity, (dim,), allowed=f"{dim} finite numbers")
+        if not np.allclose(v, self.guide(dim) @ v):
+            raise ValueError(f"Tool: velocity = {line(self.velocity)}, must be along its direction")
+        return v
+
+    def guide(self, dim: int) -> NDArray[np.float64]:
+        """Return the projection (d, d) on the ways that a free tool may go."""
+        along = self.along(dim)
+        return np.eye(dim) if self.direction is None else np.outer(along, along)
 
     def pushes(self, t: float) -> float:
         """Return the load at time t (s), N; nan where none pushes the tool."""
@@ -152,26 +192,28 @@ class Tool:
                 self._given(name, 0.0, dim if name == "displacement" else 0)
         self._centre(dim)
         self.along(dim)
+        self.begins(dim)
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:
             return np.zeros(dim) - self._base
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
-    def pose(self, t: float, dim: int, way: float = 0.0) -> Pose:
-        """Return where the tool is at time t (s), after a load has pushed it by a way, m."""
+    def pose(self, t: float, dim: int, way: NDArray[np.float64] | float = 0.0) -> Pose:
+        """Return where the tool is at time t (s), after forces have pushed it by a way, m, a vector of a free tool."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
         R, angle = np.eye(dim), float(self._given("rotation_rad", t))
         if angle:
             R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + way * self.along(dim))
+        gone = way if np.ndim(way) else way * self.along(dim)
+        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + gone)
 
-    def drawn(self, grid: Grid, t: float, way: float = 0.0) -> NDArray[np.float64]:
+    def drawn(self, grid: Grid, t: float, way: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid's cells that the tool fills at time t (s): for pictures.
 
-        way, m: by which a load has pushed it.
+        way, m: by which forces have pushed it, see `pose`.
         Corners beyond its surface are put onto it; so its edges are blunt by a part of a cell.
         """
         pose = self.pose(t, grid.dim, way)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
@@ -87,7 +88,7 @@ class Tools:
         self._held = held
         self.names, self.tools = tuple(tools), tuple(tools.values())
         still = np.zeros(len(self.tools))
-        self._ways = Ways(0.0, 0.0, still, still)
+        self._ways, self._end = Ways(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
             raise ValueError("tools: one is given twice, must be tools of their own")
         for tool in self.tools:
@@ -107,11 +108,55 @@ class Tools:
         """Whether the tangent is symmetric."""
         return not any(tool.grips for tool in self.tools)
 
-    def going(self, ways: Ways) -> Tools:
-        """Return the tools as loads push them in a step."""
+    @property
+    def free(self) -> bool:
+        """Whether forces move any of them."""
+        return any(tool.free for tool in self.tools)
+
+    @property
+    def masses(self) -> NDArray[np.float64]:
+        """Masses (tools,), kg, 0 of those that are not free."""
+        return np.array([tool.mass or 0.0 for tool in self.tools])
+
+    @property
+    def guides(self) -> NDArray[np.float64]:
+        """Projections (tools, d, d) on the ways that free tools may go, in axisymmetry along the axis."""
+        d = self.grid.dim
+        out = np.array([tool.guide(d) * tool.free for tool in self.tools])
+        return out * (np.arange(d) > 0)[:, None] if self.grid.axisymmetric else out
+
+    def pushes(self, t: float) -> NDArray[np.float64]:
+        """Return the loads (tools, d), N, on free tools at time t (s)."""
+        d = self.grid.dim
+        return np.array([np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools])
+
+    def going(self, ways: Ways, end: float | None = None) -> Tools:
+        """Return the tools as loads push them in a step; end: of the step of bodies with inertia, s."""
         tools = copy(self)
-        tools._ways = ways
+        tools._ways, tools._end = ways, end
         return tools
+
+    def pose(self, number: int, t: float) -> Pose:
+        """Return where a tool is at time t (s)."""
+        return self._pose(self.tools[number], t)
+
+    def _posed(self, tool: Tool, start: float, t: float) -> Pose:
+        """Return where a tool is in a substep that ends at time t (s), with inertia where it has its velocity.
+
+        See `in_step`.
+        """
+        pose = self._pose(tool, t)
+        if self._end is None or not start < t < self._end or tool.free:
+            return pose
+        before, end = self._pose(tool, start), self._pose(tool, self._end)
+        share = (t - start) / (self._end - start)
+        shift = in_step(share, before.shift, pose.shift, end.shift)
+        if not (end.R != before.R).any():
+            return pose._replace(shift=shift)
+        turns = [of.R @ before.R.T for of in (pose, end)]
+        angle = in_step(share, 0.0, *(np.arctan2(turn[1, 0], turn[0, 0]) for turn in turns))
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        return pose._replace(shift=shift, R=turn @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
         """Return where a tool is at time t (s); in axisymmetry it goes along the axis."""
@@ -134,8 +179,9 @@ class Tools:
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
         resists = self._materials.table(cut.points, resistance)[patches.at]
-        poses, found = [self._pose(tool, t) for tool in self.tools], []
-        loads = [tool.pushes(t) if t > start else np.nan for tool in self.tools]  # initial stresses are without them
+        poses, found = [self._posed(tool, start, t) for tool in self.tools], []
+        # initial stresses are without them
+        loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)

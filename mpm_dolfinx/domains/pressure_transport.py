@@ -72,6 +72,12 @@ class PiecePressures:
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
+    def less(self, slope: NDArray[np.float64]) -> PiecePressures:
+        """Return the same of what pressures differ by from those of an even slope (d,), Pa/m."""
+        even = self.x @ slope
+        bounds = self.bounds - even[:, None]
+        return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
+
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
         """Return the pieces of the points of these ids, or of all others."""
         rows = np.isin(self.id, ids) == kept

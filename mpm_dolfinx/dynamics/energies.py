@@ -21,7 +21,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
     """Return the kinetic and elastic energies, J, of points; on all processes together."""
-    mass = materials.density(points) * points.volume0 * points.J
+    mass = materials.present_density(points) * points.volume0 * points.J
     v, L = points.data[VELOCITY], velocity_gradients(points)
     spread = spreads(points.corners, materials.grid.axisymmetric)
     turning = np.einsum("nij,njk,nik->n", L, spread, L)
@@ -29,21 +29,26 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
     return dict(zip(("kinetic", "elastic"), over_all(materials.grid.comm, np.array([kinetic, elastic])), strict=True))
 
 
-def begun(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, as works begin to count: see `Result.energies`; `internal` is the work of stresses."""
-    works = dict.fromkeys(("internal", "viscous", "external"), 0.0)
-    return _named(stored(materials, points), works, 0.0)
+def begun(materials: SceneMaterials, points: MaterialPoints, kinetic: float) -> dict[str, NDArray[np.float64]]:
+    """Return the energies, J, as works begin to count: see `Result.energies`; `internal` is the work of stresses.
+
+    kinetic: that of free tools, J.
+    """
+    works = dict.fromkeys(("internal", "viscous", "friction", "external"), 0.0)
+    return _named(stored(materials, points), works, 0.0, kinetic)
 
 
 def after(
     before: Mapping[str, NDArray[np.float64]],
     materials: SceneMaterials,
     points: MaterialPoints,
+    kinetic: float,
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, after a step from those before it.
 
+    kinetic: that of free tools, J.
     seconds, powers: times, s, in which the last powers count, W, on this process, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
@@ -51,8 +56,11 @@ def after(
     works = {name: float(before[name]) + more for name, more in work}
     now = stored(materials, points)
     start = before["elastic"] + before["dissipated"] - before["internal"]
-    return _named(now, works, start + works["internal"] - now["elastic"])
+    return _named(now, works, start + works["internal"] - now["elastic"], kinetic)
 
 
-def _named(now: Mapping[str, float], works: Mapping[str, float], dissipated: float) -> dict[str, NDArray[np.float64]]:
+def _named(
+    now: Mapping[str, float], works: Mapping[str, float], dissipated: float, kinetic: float
+) -> dict[str, NDArray[np.float64]]:
+    now = {**now, "kinetic": now["kinetic"] + kinetic}
     return {name: np.array(float(value)) for name, value in {**now, **works, "dissipated": dissipated}.items()}

@@ -85,7 +85,7 @@ class QuietSides(Acting):
         """Return their forces on the present surface."""
         rows, d = [], self._grid.dim
         points = place.points
-        rho, shear = self._materials.density(points), self._materials.table(points, lambda m: m.shear)
+        rho, shear = self._materials.present_density(points), self._materials.table(points, lambda m: m.shear)
         across, along = np.sqrt(rho * shear), np.sqrt(rho * self._materials.confined_modulus(points))
         for name, (side, faces) in self._sides.items():
             p = place.cut.surface(faces)

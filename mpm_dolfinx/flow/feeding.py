@@ -9,7 +9,8 @@ as the residual is assembled.  The storage loops over them, and knows none by na
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ class Wet(NamedTuple):
 
     cut, points: the domains as they are cut, and the points with the places that count; contents: of the cells;
     pieces: points of integration, None where only open sides are asked for; t: end of the substep, s; drains: whether
-    pores drain under suction.
+    pores drain under suction; dt: the step, s; outcome: of the step before.
     """
 
     cut: CutDomains
@@ -36,6 +37,8 @@ class Wet(NamedTuple):
     t: float
     pieces: PointData | None = None
     drains: bool = False
+    dt: float = np.inf
+    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
 
 
 class Fluid(NamedTuple):
@@ -100,6 +103,19 @@ class Feeds:
         """Return what falls on the bodies and does not soak in, m^d/s, by name; all processes together."""
         return {}
 
+    def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
+        """Return what `volumes` needs of a substep, by name; all processes together."""
+        return {}
+
+    def volumes(
+        self, passed: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
+    ) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return volumes since the conditions began, m^d, by quantity and name, after a step.
+
+        passed, seconds: of its substeps, see `passing`, and the times that these count, s.
+        """
+        return {}
+
 
 def open_sides(feeds: Sequence[Feeds], dim: int) -> OpenSides:
     """Return the open sides of all that acts on the fluid, with what they give."""
@@ -134,4 +150,8 @@ class Feeding:
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
         """Return `Feeds.run_off` of this value, before a first step."""
+        return {}
+
+    def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return `Feeds.volumes` before a first step."""
         return {}

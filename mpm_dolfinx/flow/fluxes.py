@@ -358,10 +358,19 @@ class FluxForms:
         d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
         d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
+        apart = across * n0 - ufl.jump(self.centroid + self.moved)
+        if inertial is not None:
+            # over two cells as the mass has it, a sixth of each node beside the face: by the face's value alone water
+            # that flows freely would have more mass, in what alternates from node to node, than all of the soil
+            kink = ufl.dot(ufl.grad(inertial)("+"), n0) - ufl.dot(ufl.grad(inertial)("-"), n0)
+            along = ufl.avg(inertial) - across / 6 * kink
+            weight = along if weight is None else weight + along
+        fall = 0.0 if weight is None else ufl.dot(weight, apart)
         if relative is not None:
-            means, slopes = relative.between(pressure)
-            k0, k1 = (k * relative.conducts(side, means) for k, side in ((k0, "+"), (k1, "-")))
-        T = share * k0 * k1 / (d0 * k1 + d1 * k0 + TINY)
+            between = relative.between(pressure, fall)
+            k0, k1 = (k * relative.conducts(side, [one.k for one in between]) for k, side in ((k0, "+"), (k1, "-")))
+        resists = d0 * k1 + d1 * k0 + TINY
+        T = share * k0 * k1 / resists
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
         self.dt = fem.Constant(mesh, 0.0)
@@ -373,8 +382,8 @@ class FluxForms:
         self.slope = fem.Function(grid.cellwise((d,)))
         self.density = fem.Function(Q)
         self._sum = fem.Function(Q)
-        apart = ufl.jump(self.centroid)
-        along = apart - ufl.dot(apart, n0) * n0
+        off = ufl.jump(self.centroid)
+        along = off - ufl.dot(off, n0) * n0
         self.aslant = None
         if flows and not grid.axisymmetric:
             carried = T * ufl.avg(self.density)
@@ -382,25 +391,27 @@ class FluxForms:
         self.gravity = None
         self.even = None
         """Where pores drain, the slope of the fluxes but for that of what the weight drives: outflows rise with it."""
-        if inertial is not None:
-            # over two cells as the mass has it, a sixth of each node beside the face: by the face's value alone water
-            # that flows freely would have more mass, in what alternates from node to node, than all of the soil
-            kink = ufl.dot(ufl.grad(inertial)("+"), n0) - ufl.dot(ufl.grad(inertial)("-"), n0)
-            along = ufl.avg(inertial) - across / 6 * kink
-            weight = along if weight is None else weight + along
         if (weight is not None or relative is not None) and flows:
-            apart = across * n0 - ufl.jump(self.centroid + self.moved)
             # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
             # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
-            drives = ufl.jump(pressure) + (0.0 if weight is None else ufl.dot(weight, apart))
+            drives = ufl.jump(pressure) + fall
             driven = T * density * drives * ufl.jump(q) * dS
             self.gravity = FacetForm(driven, grid.comm)
             if relative is not None:
-                by_k = [ufl.diff(T, k) * (a * dp("+") + b * dp("-")) for k, (a, b) in zip(means, slopes, strict=True)]
+
+                def by_k(k):
+                    """Return the slope of T by k_r of a law: where next to nothing conducts squares of it vanish."""
+                    return share * (
+                        d0 * (k1 / resists) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resists) ** 2 * ufl.diff(k1, k)
+                    )
+
                 whole, even = (
-                    density * (T * ufl.jump(dp) + by * sum(by_k)) * ufl.jump(q) * dS
-                    for by in (drives, ufl.jump(pressure))
+                    density * (T * ufl.jump(dp) + by * sum(rises)) * ufl.jump(q) * dS
+                    for by, rises in (
+                        (drives, [by_k(one.k) * _along(dp, one.slopes) for one in between]),
+                        (ufl.jump(pressure), [by_k(one.k) * _along(dp, one.even) for one in between]),
+                    )
                 )
                 self.flux, self.even = FacetForm(whole, grid.comm), FacetForm(even, grid.comm)
 
@@ -437,3 +448,8 @@ class FluxForms:
             f.x.array.reshape(-1, d)[filled] = rows
             f.x.scatter_forward()
         return mobility
+
+
+def _along(dp, slopes: tuple):
+    """Return what changes by slopes on both sides of a face, as UFL."""
+    return slopes[0] * dp("+") + slopes[1] * dp("-")

@@ -30,7 +30,7 @@ hundredfold, damps second differences only (`second_differences`): on jumps it w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -42,7 +42,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
-from mpm_dolfinx.base.tolerances import EPSILON, SAME
+from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
@@ -51,6 +51,7 @@ from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
@@ -118,7 +119,7 @@ class StorageForms:
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
     retentions
-        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention, lever and pores.
     """
 
     def __init__(
@@ -156,11 +157,11 @@ class StorageForms:
         self.retains = retentions is not None
         """Whether pores drain under suction."""
         if self.retains:
-            full, before = (retentions.of("saturation", at, pieces.retention) for at in (p, self.p_n))
+            full, before = (retentions.of("saturation", at, pieces) for at in (p, self.p_n))
             denser = ufl.exp(-fem.Constant(self.grid.mesh, 1 / (2 * bulk)) * (p - self.p_n))
             drained = (full - before) * pieces.pores
             stored = full * stored + drained * denser
-            felt = ufl.diff(p * retentions.of("bishop", p, pieces.retention), p)
+            felt = ufl.diff(p * retentions.of("bishop", p, pieces), p)
             self._capacity = CellSums([ufl.diff(drained, p), full * felt], pieces)
         self._change = PointForm(stored * q * pieces.dx, pieces)
         by_u = [pieces.biot * felt * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
@@ -465,6 +466,19 @@ class StorageProblem:
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
+    def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
+        """Return what `volumes` needs of a solved substep."""
+        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        return [one.passing(at, fluid) for one, at in both]
+
+    def volumes(self, passed: Sequence[Sequence[Mapping]], seconds: Sequence[float]) -> dict[str, dict]:
+        """Return volumes since the conditions began, see `Feeds.volumes`."""
+        found = [one.volumes(of, seconds) for one, of in zip(self._feeds, zip(*passed, strict=True), strict=True)]
+        out: dict[str, dict] = {}
+        for quantity, of in (pair for one in found for pair in one.items()):
+            out[quantity] = out.get(quantity, {}) | of
+        return out
+
     @property
     def linear(self) -> bool:
         """Whether the tangent does not depend on the pressure."""
@@ -481,6 +495,13 @@ class StorageProblem:
         owned = self.system.unknowns.owned
         capacity = self.forms.derivatives(self.data)[0]
         return lost / (capacity + self._contents.fixed_stress)[owned]
+
+    def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what errors of the pressures (n,), Pa, make of the water content, and its change in the step (n,)."""
+        capacity, _ = self.forms.drained(self.data)
+        change = self.forms.change(self.data)[self.system.unknowns.owned]
+        share = self.fill / self._contents.volume
+        return share * capacity * error, share * np.abs(change)
 
     @property
     def ring(self) -> float:
@@ -664,10 +685,12 @@ class StorageProblem:
 
 
 def _falls(A: PETSc.Mat) -> bool:
-    """Return whether a row of a matrix has a diagonal that is not positive, or another entry that is."""
+    """Return whether a row of a matrix has a diagonal that is not positive, or another entry that is, by its size."""
     starts, columns, values = A.getValuesCSR()
     row = np.repeat(np.arange(len(starts) - 1), np.diff(starts)) + A.getOwnershipRange()[0]
-    return bool((np.where(row == columns, values <= 0, values > 0)).any())
+    size = sum_by(row - A.getOwnershipRange()[0], np.abs(values), len(starts) - 1)
+    least = ROUND_OFF * size[row - A.getOwnershipRange()[0]]
+    return bool((np.where(row == columns, values <= 0, values > least)).any())
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:

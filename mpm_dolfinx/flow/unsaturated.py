@@ -2,22 +2,96 @@
 """Fluxes in soil whose pores drain: conductivities by the pressures on both sides of a face.
 
 Through a face soil conducts as on the mean over the pressures between the two sides (`retention.Conductance`): neither
-that of the wetter side, which would let a front run ahead, nor the mean of both.  A cell that holds several soils
+that of the wetter side, which would let a front run ahead, nor the mean of both.  Where the fluid's weight drives as
+well, that mean is `fitted`: steady flow through exponential soil is met exactly.  A cell that holds several soils
 conducts by the sum of their shares.  In series their resistances are those at the start of a substep.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import CENTRAL
+from mpm_dolfinx.base.tolerances import CENTRAL, EPSILON, SECOND, TINY
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.pores.retention import Conductance, Retentions
+
+
+class Functions(NamedTuple):
+    """Functions of numbers, of arrays or as UFL."""
+
+    ln: Callable[[Any], Any]
+    exp: Callable[[Any], Any]
+    tanh: Callable[[Any], Any]
+    where: Callable[[Any, Any, Any], Any]
+    less: Callable[[Any, Any], Any]
+    largest: Callable[[Any, Any], Any]
+
+
+NUMPY = Functions(np.log, np.exp, np.tanh, np.where, np.less, np.maximum)
+UFL = Functions(ufl.ln, ufl.exp, ufl.tanh, ufl.conditional, ufl.lt, ufl.max_value)
+
+
+class Between(NamedTuple):
+    """k_r between the two sides of a face; its slopes by both pressures, 1/Pa; these at the same share of the mean."""
+
+    k: Any
+    slopes: tuple[Any, Any]
+    even: tuple[Any, Any]
+
+
+def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) -> Between:
+    """Return k_r between the two sides of a face.
+
+    With k the mean of k_r over the pressures, x its jump over k, y = x fall / jump of the pressure, and
+    s(z) = sinh(z / 2) / (z / 2), it is k s(x + y) / (s(x) s(y)).  So an exponential k_r conducts as in steady flow
+    (Baker 1995), none more than on the wetter side; k is left where no weight drives (Kirchhoff 1894).  Where pressures
+    are next to the same k is the mean of both sides.
+
+    Parameters
+    ----------
+    p
+        Pressures on both sides, Pa.
+    tables
+        Of both sides: integral of k_r, Pa, k_r, its slope, 1/Pa, see `retention.Conductance`.
+    fall
+        What the fluid's weight drives by from the first side to the second, Pa.
+    scale
+        Suction about which k_r falls, Pa.
+    of
+        Functions for these arguments.
+    """
+    (phi0, k0, d0), (phi1, k1, d1) = tables
+    jump = p[0] - p[1]
+    close = of.less(abs(jump), CENTRAL * (abs(p[0]) + abs(p[1]) + scale))
+    apart = of.where(close, 1.0, jump)
+    mean = of.largest(of.where(close, (k0 + k1) / 2, (phi0 - phi1) / apart), 0.0)
+    rise0, rise1 = of.where(close, d0 / 2, (k0 - mean) / apart), of.where(close, d1 / 2, (mean - k1) / apart)
+    least = of.largest(mean, EPSILON * (abs(k0) + abs(k1)) + TINY)
+    x = (k0 - k1) / least
+    x0, x1 = (d0 - x * rise0) / least, -(d1 + x * rise1) / least
+    rate = of.where(close, (d0 + d1) / of.largest(k0 + k1, EPSILON * scale * abs(d0 + d1) + TINY), x / apart)
+    y = rate * fall
+    y0, y1 = (of.where(close, 0.0, fall * (slope - sign * rate) / apart) for slope, sign in ((x0, 1), (x1, -1)))
+    (both, by_both), (one, by_one), (other, by_other) = (_log_sinhc(z, of) for z in (x + y, x, y))
+    factor = of.exp(both - one - other)
+    k, even = factor * mean, (factor * rise0, factor * rise1)
+    turns = (k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for dx, dy in ((x0, y0), (x1, y1)))
+    return Between(k, tuple(slope + turn for slope, turn in zip(even, turns, strict=True)), even)
+
+
+def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
+    """Return ln(sinh(z / 2) / (z / 2)) and its slope."""
+    small = of.less(abs(z), SECOND)
+    half = of.where(small, 1.0, z / 2)
+    size = abs(half)
+    value = size + of.ln((1 - of.exp(-2 * size)) / (2 * size))
+    return of.where(small, z * z / 24, value), of.where(small, z / 12, (1 / of.tanh(half) - 1 / half) / 2)
 
 
 class Relative:
@@ -43,27 +117,15 @@ class Relative:
         self._tables = fem.Function(grid.cellwise((3 * len(self._laws),)))
         self._mesh = grid.mesh
 
-    def between(self, pressure: fem.Function) -> tuple[list, list]:
-        """Return k_r of each law between the two sides of a face as UFL variables, and their slopes by both pressures.
-
-        It is the quotient of the differences of the integral and the pressure, or the mean where these are next to
-        nothing.
-        """
-        p0, p1 = pressure("+"), pressure("-")
-        means, slopes = [], []
+    def between(self, pressure: fem.Function, fall) -> list[Between]:
+        """Return k_r of each law between the two sides of a face as UFL variables: see `fitted`."""
+        out = []
         for i, law in enumerate(self._laws):
-            (phi0, k0, d0), (phi1, k1, d1) = ([self._tables(side)[3 * i + j] for j in range(3)] for side in "+-")
+            tables = [[self._tables(side)[3 * i + j] for j in range(3)] for side in "+-"]
             scale = fem.Constant(self._mesh, law.scale)
-            close = ufl.lt(abs(p0 - p1), CENTRAL * (abs(p0) + abs(p1) + scale))
-            apart = ufl.conditional(close, 1.0, p0 - p1)
-            k = ufl.conditional(close, (k0 + k1) / 2, (phi0 - phi1) / apart)
-            means.append(ufl.variable(k))
-            by_both = (
-                ufl.conditional(close, d0 / 2, (k0 - k) / apart),
-                ufl.conditional(close, d1 / 2, (k - k1) / apart),
-            )
-            slopes.append(by_both)
-        return means, slopes
+            found = fitted([pressure(side) for side in "+-"], tables, fall, scale, UFL)
+            out.append(found._replace(k=ufl.variable(found.k)))
+        return out
 
     def conducts(self, side: str, means: Sequence):
         """Return the mobility of the cell on a side of a face, as UFL of k_r of each law there."""
@@ -74,19 +136,24 @@ class Relative:
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws], axis=1).ravel()
 
     def through_sides(
-        self, cells: NDArray[np.int32], p: NDArray[np.float64], outer: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes by theirs."""
+        self,
+        cells: NDArray[np.int32],
+        p: NDArray[np.float64],
+        outer: NDArray[np.float64],
+        fall: NDArray[np.float64] | float = 0.0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes, see `Between`.
+
+        fall (m,), Pa: what the fluid's weight drives by out of the cells.
+        """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, slope = shares[:, 0].copy(), np.zeros(len(p))
+        k, (slope, even) = shares[:, 0].copy(), np.zeros((2, len(p)))
         for law, share in zip(self._laws, shares.T[1:], strict=True):
-            (phi, here, d), (beyond, there, _) = law(p).T, law(outer).T
-            close = np.abs(p - outer) < CENTRAL * (np.abs(p) + np.abs(outer) + law.scale)
-            apart = np.where(close, 1.0, p - outer)
-            mean = np.where(close, (here + there) / 2, (phi - beyond) / apart)
-            k += share * mean
-            slope += share * np.where(close, d / 2, (here - mean) / apart)
-        return k, slope
+            between = fitted((p, outer), (law(p).T, law(outer).T), fall, law.scale, NUMPY)
+            k += share * between.k
+            slope += share * between.slopes[0]
+            even += share * between.even[0]
+        return k, slope, even
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
         """Set the shares (n, count) of the filled owned cells."""

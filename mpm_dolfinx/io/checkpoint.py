@@ -247,7 +247,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
                 continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
                 raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
-            if quantity == "tool_travel" and not np.isfinite(value):
+            if quantity in ("tool_travel", "tool_velocity") and not np.isfinite(value).all():
                 raise ValueError(f"outcome/{quantity}/{name} is not finite")
     return found
 

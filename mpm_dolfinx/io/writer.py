@@ -194,7 +194,7 @@ def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 def _write_tools(simulation: Simulation, file: Path) -> None:
     """Write what tools fill of the grid's cells, with their numbers and forces."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
-    corners = [tool.drawn(grid, simulation.t, float(simulation.tool_travel[name])) for name, tool in tools.items()]
+    corners = [tool.drawn(grid, simulation.t, simulation.tool_travel[name]) for name, tool in tools.items()]
     forces = np.stack([simulation.tool_forces[name][: grid.dim] for name in tools])
     number = np.repeat(np.arange(len(tools)), [len(one) for one in corners])
     with replacing(file) as part:

@@ -102,8 +102,6 @@ class SceneMaterials:
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
-        self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
-        """Largest oedometric modulus, Pa."""
         self.uneven = any(
             max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
             for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
@@ -266,7 +264,7 @@ class SceneMaterials:
         """Laws of retention, if there are any."""
         laws = list(dict.fromkeys(self.materials[i].retention for i in self._used))
         some = [law for law in laws if law is not None]
-        return Retentions(some, None not in laws) if some and self.fluid is not None else None
+        return Retentions(some, None not in laws, self.grid) if some and self.fluid is not None else None
 
     @cached_property
     def _saturation(self) -> SaturationAt:
@@ -393,12 +391,13 @@ class SceneMaterials:
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
-    def drained_density(self, points: MaterialPoints) -> NDArray[np.float64] | float:
-        """Return what of this density is not there, as pores have drained (n,), kg/m^3."""
+    def present_density(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the density of soil and of the water that its pores hold at the points (n,), kg/m^3."""
+        density = self.density(points)
         if self.retentions is None:
-            return 0.0
+            return density
         empty = 1 - self.saturation(points, points.pressure)[0]
-        return empty * self.porosity(points) * self.fluid.density
+        return density - empty * self.porosity(points) * self.fluid.density
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.

@@ -205,7 +205,7 @@ class InitialStresses:
             raise ValueError("initial_stress: K0 without gravity at the start, nor a surcharge: must have one of these")
         # the densities of all points on all processes
         seeded, total = materials.seeded, np.zeros(self._start[-1])
-        total[seeded.id] = materials.density(seeded) - materials.drained_density(seeded)
+        total[seeded.id] = materials.present_density(seeded)
         total = over_all(materials.grid.comm, total)
         here = np.repeat(present, [len(body) for body in self._bodies])
         corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -13,6 +14,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
@@ -114,7 +116,13 @@ class GivenDisplacements(Acting):
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
         forms = self._forms(HoldForms)
         return HoldLoads(
-            self, forms, forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, own
+            self,
+            forms,
+            forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields),
+            held,
+            row,
+            own,
+            place,
         )
 
     def _held_points(
@@ -185,6 +193,20 @@ class GivenDisplacements(Acting):
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), x + self._grid.base, why)
             self._warned.add(number)
 
+    def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Refuse a step in which the gap to a given displacement grows by most of the way, wherever it moves."""
+        for hold, faces, axes in self._holds:
+            p = place.cut.surface(faces)
+            start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
+            gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
+            old, new, way = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
+            moves = way > NEAR * self._grid.h.min()
+            came = 1 - ((new - old)[moves] / way[moves]).min(initial=np.inf)
+            came = over_all(self._grid.comm, float(came), MPI.MAX)
+            if -np.inf < came < 0.5:  # nearer to none of the way than to all of it
+                what = f"{line(hold)}: the bodies come {max(0.0, came):.0%} of the way that is given at most"
+                raise NotConverged(f"{what}, must have room there: pores that are sealed keep their water")
+
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
@@ -221,6 +243,8 @@ class HoldLoads(Loads):
         Which of it each component is.
     share : (m, 2^d)
         Of its force on each node, but for what walls bear.
+    place
+        Where and when they were placed.
     """
 
     stiff = True
@@ -233,6 +257,7 @@ class HoldLoads(Loads):
         held: HeldCells,
         row: NDArray[np.int64],
         share: NDArray[np.float64],
+        place: Place,
     ):
         self._acting = acting
         self._forms = forms
@@ -240,6 +265,7 @@ class HoldLoads(Loads):
         self.held = held
         self.row = row
         self.share = share
+        self._place = place
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
@@ -256,7 +282,7 @@ class HoldLoads(Loads):
     def moved(self, u: fem.Function) -> Loads:
         """Return given displacements that are off their place by so much more."""
         data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
-        return HoldLoads(self._acting, self._forms, data, self.held, self.row, self.share)
+        return HoldLoads(self._acting, self._forms, data, self.held, self.row, self.share, self._place)
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
@@ -306,6 +332,10 @@ class HoldLoads(Loads):
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])
         return of_cells + 4 * EPSILON * grid.reach * held
+
+    def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Refuse a step in which the bodies have not come along."""
+        self._acting.check_came(self._place, points, before)
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions."""

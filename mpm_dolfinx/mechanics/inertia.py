@@ -324,11 +324,13 @@ class Mass:
         moved : (n,)
             Cells by which corners have moved at most where the grid is reset, else 0.
         """
-        before, after = (self._at_points(points, v) for v in velocities)
-        out, k = {}, -np.expm1(-RELAXES * moved)
-        for name, start, end in zip((VELOCITY, RATE), before, after, strict=True):
-            own = points.data[name]
-            out[name] = own + (end - start) + k.reshape(-1, *[1] * (own.ndim - 1)) * (start - own)
+        start, end = velocities
+        out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
+        if self._forms.grid.comm.allreduce(int(moved.any())):
+            k = -np.expm1(-RELAXES * moved)
+            for name, values in self._at_points(points, start).items():
+                own = points.data[name]
+                out[name] += k.reshape(-1, *[1] * (own.ndim - 1)) * (values - own)
         return out
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
@@ -345,25 +347,24 @@ class Mass:
         return pieces.x - self._cut.mean(pieces.x)[pieces.point]
 
     @cached_property
-    def _spread(self) -> NDArray[np.float64]:
-        """Second moments (n, d, d), m^2, of the domains about their centroids."""
-        return self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second)
+    def _focus(self) -> NDArray[np.float64]:
+        """Inverses (n, d, d), 1/m^2, of the second moments of the domains about their centroids."""
+        return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
 
-    def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the affine field over each domain that is nearest to nodal velocities: v (n, d), F' (n, d, d)."""
+    def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
+        """Return the affine field over each domain that is nearest to nodal velocities: `VELOCITY` and `RATE`."""
         cut, grid, d, nodal = self._cut, self._forms.grid, self._forms.grid.dim, self.local(v)
         at, slope = grid.at(cut.cells, cut.x, nodal.reshape(-1, d)), self._pieces.gradients_of(nodal)
         at, slope = (cut.to_pieces(values) for values in (at, slope.reshape(-1, d, d)))
         mean = cut.mean(at)
         moment = (at - mean[cut.pieces.point])[:, :, None] * self._off[:, None] + slope @ cut.pieces.second
-        C = np.linalg.solve(self._spread, cut.mean(moment).swapaxes(1, 2)).swapaxes(1, 2)
-        return mean, C @ points.F[:, :d, :d]
+        return {VELOCITY: mean, RATE: cut.mean(moment) @ self._focus @ points.F[:, :d, :d]}
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
     """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry in the plane."""
     d = points.x.shape[1]
-    return points.data[RATE] @ np.linalg.inv(points.F[:, :d, :d])
+    return points.data[RATE] @ inverses(points.F[:, :d, :d])
 
 
 class Inertia(Loads):

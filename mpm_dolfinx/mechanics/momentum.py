@@ -29,7 +29,7 @@ from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
 from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints
-from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.forms.unknowns import Unknowns, matrix, renew, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
@@ -72,7 +72,7 @@ class MomentumForms:
     inertia
         Whether bodies may have inertia.
     retentions
-        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention, lever and pores.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class MomentumForms:
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
         self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
-        full = None if retentions is None else retentions.of("saturation", pressure, pieces.retention)
+        full = None if retentions is None else retentions.of("saturation", pressure, pieces)
         self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
@@ -148,7 +148,7 @@ class MomentumForms:
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
             if self._retentions is not None:
-                of_pressure = self._retentions.of("bishop", pressure, points.retention) * of_pressure
+                of_pressure = self._retentions.of("bishop", pressure, points) * of_pressure
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A
@@ -475,11 +475,12 @@ class MomentumProblem:
         return b, norms
 
     def powers(self) -> dict[str, float]:
-        """Return powers at u on this process, W: of stresses, against what resists the velocity, and of what acts."""
+        """Return powers at u on this process, W: of stresses, of what resists velocity or slip, and of what acts."""
         forms, unknowns = self.forms, self.system.unknowns
         v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # none of what walls hold
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
-        out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "external": 0.0}
+        out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "friction": 0.0}
+        out["external"] = 0.0
         for one in self.loads:
             acts, resists = np.zeros((2, len(v)))  # those on ghosts count where they are added
             one.dead(acts)
@@ -489,6 +490,9 @@ class MomentumProblem:
             one.push(self.at, pushed, unknowns)
             out["external"] += acts @ v + one.pulling(self.at, v) - v[unknowns.owned] @ pushed.array_r
             out["viscous"] += resists @ v
+            rubs, more = one.rubbing(self.at, v)
+            out["friction"] += rubs
+            out["external"] += more
         return out
 
     def out_of_balance(
@@ -549,6 +553,8 @@ class MomentumProblem:
                 K.axpy(1.0, zeros, pattern.UNKNOWN)
             if (coupling := one.coupling(self.at)) is not None:
                 K.axpy(1.0, coupling, pattern.SUBSET_NONZERO_PATTERN)
+        if first:
+            renew(K)
         shares = np.broadcast_to(firmness, self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():

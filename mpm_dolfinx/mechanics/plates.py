@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -24,6 +25,7 @@ from mpm_dolfinx.conditions.sides import gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.mechanics.tractions import Tractions
+from mpm_dolfinx.parallel.exchange import over_all
 
 
 class PlateForms:
@@ -79,11 +81,14 @@ class Plates(Acting):
         d = self._grid.dim
         rows = []
         grid = self._grid
+        oedometric = self._materials.table(place.points, lambda m: m.oedometric)
         for faces in self._faces:
             patches = place.cut.surface(faces)
             area = patches.area(place.points)
             length = faces.area0.sum() ** (1 / (d - 1))
-            rigidity = RIGIDITY * self._materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
+            modulus = oedometric[patches.at].max(initial=0.0)  # of what it lies on, wherever else stiffer bodies are
+            rigidity = RIGIDITY * over_all(grid.comm, float(modulus), MPI.MAX) * length
+            rigidity = rigidity * np.linalg.norm(area, axis=1, keepdims=True)
             axis = facing(faces)[0]
             normal = np.tile(np.eye(d)[axis], (len(area), 1))
             tilt = normal - area / area[:, [axis]]  # slope of the face: its normal is (-slope, 1)

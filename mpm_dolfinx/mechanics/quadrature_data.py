@@ -69,10 +69,14 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Where the pieces of a cut lie, and which rows of them belong to each of several parts, with their places."""
+    """Where the pieces of a cut lie, and which rows of them belong to each of several parts, with their places.
+
+    lever (m, d), m: ways to the pieces from the centroids of what their cells hold, once these are known.
+    """
 
     pieces: Places
     parts: tuple[tuple[NDArray[np.int64], Places], ...]
+    lever: NDArray[np.float64] | None = None
 
 
 class QuadraturePoints:
@@ -116,7 +120,8 @@ class QuadraturePoints:
         if fluid:
             shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
             shapes |= {"drainage": (2,)} if scene.drains else {}
-            shapes |= {"retention": (scene.retentions.width,), "pores": ()} if scene.retentions else {}
+            if scene.retentions:
+                shapes |= {"retention": (scene.retentions.width,), "pores": (), "lever": (d,)}
         if weighs:
             shapes |= {"density": ()}
         if extended:
@@ -125,7 +130,7 @@ class QuadraturePoints:
         if self.varies:
             shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
-        common = [*own, *["biot"] * bool(fluid), *["retention"] * bool(scene.retentions)]
+        common = [*own, *["biot"] * bool(fluid), *["retention", "lever"] * bool(scene.retentions)]
         self.laws = scene.parts(self.pieces, common)
         self._locks = any(locks for *_, locks in self.laws)
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
@@ -161,6 +166,7 @@ class QuadraturePoints:
         """Return the pieces with all their data: those of a cut, with what the points carry now."""
         changing = {name: cut.to_cells(values) for name, values in self._changing(points).items()}
         fields = {**self._constant(cut, points), **changing, **self._own(cut, points)}
+        fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         if self._locks and cut.domains:
             share = self._scene.locking(points) * self._scene.table(points, lambda m: told_share(m, bool(self._fluid)))
@@ -239,7 +245,7 @@ class QuadraturePoints:
 
     def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the masses (n,), kg, of the points, pore fluid included."""
-        return self._scene.density(points) * points.volume0 * points.J
+        return self._scene.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
         """Return what pieces (m, 2) that conduct alike have in common."""

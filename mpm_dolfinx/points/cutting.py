@@ -500,24 +500,81 @@ def cut_faces(
     if d == 3:
         three = (both[2] == both[3]).all(axis=0)  # triangles, about a corner
         both, split = np.concatenate([both, np.where(three, both[2], both.sum(axis=0) / 4)[None]]), ABOUT_MIDDLE
-    s = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
-    owner = np.arange(s.shape[2])
-    whole = s
+    whole = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
+    count = whole.shape[2]
+    # the local coordinates tell sizes: those of a face are never degenerate, but a triangle is half of it
+    size = _size(whole[:, d:]).reshape(len(split), m)
+    share = (size / size.sum(axis=0)).ravel()
+    s = np.concatenate([whole, np.repeat(np.eye(d)[:, :, None], count, axis=2)], axis=1)  # shares of the corners, too
+    owner = np.arange(count)
     for axis in range(d):
         s, owner = _slice(s, owner, axis)
-    # the local coordinates tell sizes: those of a face are never degenerate, but a triangle is half of it
-    total = _size(whole[:, d:]).reshape(len(split), m).sum(axis=0)
-    share = _size(s[:, d:]) / total[owner % max(1, m)]
-    kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
-    s = s[:, :, kept]
-    owner = owner[kept]
-    share = share[kept]
+    kept = np.flatnonzero(_size(s[:, -d:-1]) * share[owner] > SLIVER)  # what only touches a plane leaves nothing
+    s, owner = s[:, :, kept], owner[kept]
+    if d == 3:
+        s, owner = _polygons(s, owner)
+    share = _size(s[:, -d:-1]) * share[owner]
+    s, owner = s[:, :-d], owner % max(1, m)
+    share /= sum_by(owner, share, m)[owner]  # with slivers of its parts nothing of a face is lost
     points = np.einsum("qk,kam->qam", _RULES[d], s)
     middle = np.tile((grid.low + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
     count = len(_RULES[d])
-    face = np.tile(owner % max(1, m), count)
-    return face, grid.low + grid.h * points[:, :d], points[:, d:], np.tile(share / count, count), middle
+    face, share = np.tile(owner, count), np.tile(share / count, count)
+    return face, grid.low + grid.h * points[:, :d], points[:, d:], share, middle
+
+
+def _polygons(s: NDArray[np.float64], owner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the parts of cut triangles as triangles that do not tell which axis was cut first.
+
+    The slices of a triangle in one cell are a convex polygon.  It is split about the mean of its corners.
+
+    Parameters
+    ----------
+    s : (3, a, n)
+        Corners of the slices: places in cells first, and last their shares of the corners of the triangle.
+    owner : (n,)
+        Triangles that these are slices of.
+    """
+    cut = np.bincount(owner, minlength=1)[owner] > 1
+    part, of = s[:, :, cut], owner[cut]
+    cell = np.floor(part[:, :3].mean(axis=0)).astype(np.int64)
+    cell -= cell.min(axis=1, initial=0, keepdims=True)
+    keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
+    _, first, group = np.unique(keys, return_index=True, return_inverse=True)
+    v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
+    two = slice(-3, -1)  # shares of two corners, from which areas count
+    middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
+    order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
+    v, group = v[:, order], group[order]
+    after = _around(group)
+    distinct = np.abs(v[two, after] - v[two]).max(axis=0) > SLIVER
+    v, group = v[:, distinct], group[distinct]
+    after = _around(group)
+    before = np.empty_like(after)
+    before[after] = np.arange(len(after))
+    a, b = v[two] - v[two, before], v[two, after] - v[two]
+    bend = np.abs(a[0] * b[1] - a[1] * b[0])
+    corner = bend > SLIVER * (np.linalg.norm(a, axis=0) + np.linalg.norm(b, axis=0))
+    v, group = v[:, corner], group[corner]
+    after, sides = _around(group), np.bincount(group, minlength=len(first))
+    middle = np.stack([sum_by(group, x, len(first)) for x in v]) / np.maximum(sides, 1)
+    triangle = sides[group] == 3
+    begins = np.flatnonzero(np.diff(group, prepend=-1))
+    alone = begins[triangle[begins]]
+    fan = np.flatnonzero(sides[group] > 3)
+    parts = np.stack([v[:, alone], v[:, after[alone]], v[:, after[after[alone]]]])
+    fans = np.stack([middle[:, group[fan]], v[:, fan], v[:, after[fan]]])
+    of = of[first]
+    triangles = np.concatenate([s[:, :, ~cut], parts, fans], axis=2)
+    return triangles, np.concatenate([owner[~cut], of[group[alone]], of[group[fan]]])
+
+
+def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the next member (n,) of each group, of the last the first; groups (n,) in order."""
+    after, starts = np.arange(1, len(group) + 1), np.flatnonzero(np.diff(group, prepend=-1))
+    after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
+    return after
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:

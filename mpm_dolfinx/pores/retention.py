@@ -22,6 +22,7 @@ from functools import partial
 
 import numpy as np
 import ufl
+from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
@@ -246,6 +247,8 @@ class Retentions:
     """The laws of retention of a scene, as UFL of what points carry of theirs.
 
     Points carry a row: the number of the kind of their law, from 1, and its constants; zero where pores stay full.
+    Pieces of domains also carry their `lever`, the way to them from the centroid of what their cell holds.  The
+    pressure that they see is that of water at rest about the cell's.
 
     Parameters
     ----------
@@ -253,9 +256,13 @@ class Retentions:
         The different laws of the scene's materials.
     everywhere
         Whether every material has one.
+    grid
+        Background grid.
     """
 
-    def __init__(self, laws: Sequence, everywhere: bool):
+    def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
+        self.weight = fem.Constant(grid.mesh, np.zeros(grid.dim))
+        """Weight of the fluid when the grid was reset, N/m^3; zero where none can flow."""
         self.laws = list(laws)
         self._everywhere = everywhere
         self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
@@ -279,16 +286,23 @@ class Retentions:
         """Return the number of a law among all, from 1; 0 for None."""
         return 0 if law is None else 1 + self.laws.index(law)
 
-    def of(self, name: str, p, row):
-        """Return a property of pores at pressures p, Pa, as UFL.
+    def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much pressures at levers (m, d), m, differ from those of cells (m,), Pa."""
+        return lever @ self.weight.value
+
+    def of(self, name: str, p, points: FormPoints):
+        """Return a property of the pores of points in cells of pressures p, Pa, as UFL.
 
         Parameters
         ----------
         name
             "saturation", "relative_permeability" or "bishop".
-        row
-            UFL vector of the points' row.
+        points
+            They have the fields retention and, as pieces, lever.
         """
+        row = points.retention
+        if "lever" in points.sizes:
+            p = p + ufl.dot(self.weight, points.lever)
         values = [_property(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first]
         out = values.pop(0) if self._everywhere else 1.0
         first = 2 if self._everywhere else 1
@@ -347,7 +361,7 @@ class SaturationAt:
         self._points = points = FormPoints(grid, p=(), retention=(retentions.width,))
         p = ufl.variable(points.p)
         names = ("saturation", "bishop", "relative_permeability")
-        S, chi, k = (retentions.of(name, p, points.retention) for name in names)
+        S, chi, k = (retentions.of(name, p, points) for name in names)
         self._values = PointExpression(ufl.as_vector([S, ufl.diff(S, p), chi, k]), points)
 
     def __call__(
@@ -409,7 +423,7 @@ class Conductance:
         phi = a + z * (c + z * (e + z * f))
         first, second = c + z * (2 * e + 3 * z * f), 2 * e + 6 * z * f
         by = 1 / (s * self._step)
-        k, slope = -first * by, (second * by - first / s) * by
+        k, slope = np.maximum(-first * by, 0.0), (second * by - first / s) * by
         out = np.stack([phi, k, slope], axis=1)
         wet = -p < self._edges[0]
         out[wet] = np.stack([self._whole + p, np.ones(len(p)), np.zeros(len(p))], axis=1)[wet]

@@ -54,6 +54,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     """Return what the cells hold in a state; on all processes together."""
     state = state if state.stays else state.at_owners(scene.grid)
     points = state.points
+    scene.rests_at(state.stage, state.t)
     on_grid = scene.on_grid(state.as_cut)  # the next step has use for it
     cut, places = on_grid.cut, on_grid.data.pieces.places
     weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
@@ -76,7 +77,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
         store, pores = (cut.to_cells(values(points)) for values in (scene.materials.storage, scene.materials.porosity))
         volumes = pores + store * mass_potential(pressure, scene.fluid.bulk)[places.slots]
         if scene.materials.retentions is not None:
-            at = cut.to_pieces(pressure[places.slots])
+            at = cut.to_pieces(pressure[places.slots] + on_grid.heads)
             full, _, chi, _ = scene.materials.saturation(points, at, cut.pieces.point)
             share, full = share * cut.pieces_to_cells(chi), cut.pieces_to_cells(full)
             volumes -= (1 - full) * pores * np.exp(pressure / scene.fluid.bulk)[places.slots]

@@ -152,11 +152,16 @@ class StepSize:
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return by how much the error of a step is larger than it may be: that of pressures, or of the motion."""
+        """Return by how much the error of a step is larger than it may be: of pressures, water content, or motion."""
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
         allowed = self._allowed(report, control)
-        errors = [(report.error, allowed), (error, self.rtol * motion)]
+        wrong, filled = report.fills
+        errors = [
+            (report.error, allowed),
+            (error, self.rtol * motion),
+            (wrong, self.rtol * max(control.filled, filled)),
+        ]
         return max(off / least if least > 0 else 0.0 if off == 0 else inf for off, least in errors)
 
     def _allowed(self, report: Report, control: StepControl) -> float:
@@ -174,7 +179,7 @@ def measured(control: StepControl, report: Report, result: Result) -> StepContro
     if len(result.rows) and len(start := result.pressure[0]) and report.extremes is not None:
         change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start.tolist(), strict=True)))
     motion = None if control.motion is None else max(control.motion, report.moves[1])
-    return replace(control, change=change, motion=motion)
+    return replace(control, change=change, motion=motion, filled=max(control.filled, report.fills[1]))
 
 
 class Times:

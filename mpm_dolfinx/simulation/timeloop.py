@@ -99,7 +99,8 @@ def run(
         since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
         flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
         as the output intervals; refused there with terms of the velocity, of which no error is known.  Of bodies with
-        inertia the motion counts too, see `motion_error`, in proportion to the largest since the run began.  The error
+        inertia the motion counts too, see `motion_error`, in proportion to the largest since the run began.  So does
+        the water content of soil that drains under suction, to the largest change of it in a step so far.  The error
         is estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
         the step after a load jumps, see `solve.newton.ERROR`.
     t_eval : (m,), s
@@ -289,7 +290,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
-        outcome["energy"] = begun(scene.materials, state.points)
+        outcome["energy"] = begun(scene.materials, state.points, state.stage.kinetic(outcome))
     return replace(state, outcome=outcome)
 
 

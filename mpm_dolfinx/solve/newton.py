@@ -185,9 +185,12 @@ def note_pressures(
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
         sealed = storage.sealed(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
     largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second, sealed)]
+    filling = storage.filling(error) if forms.retains else (error[:0], error[:0])
+    largest += [values.max(initial=0.0) for values in filling]
     largest += [values.max(initial=-np.inf) for values in (-p, p)]
     largest = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
-    report.error, report.change, report.first, second, report.sealed, low, high = largest
+    report.error, report.change, report.first, second, report.sealed, *fills, low, high = largest
+    report.fills = tuple(fills)
     report.extremes = (-low, high)
     report.sudden = report.first if len(rates) > 1 and second < SUDDEN * report.first else 0.0
 

@@ -153,6 +153,7 @@ class Motion:
                     owed = self._owed(state, points, on_grid, pieces, came, keeps)
                     points = replace(points, data=points.data | owed)
             _check_inside(cut, points, t, report)
+        stays = stays and not (self._materials.retentions and callable(state.stage.conditions["gravity"]))
         stay = Stay(cut.points)
         new = replace(state, t=t, points=points, pieces=carried, stay=stay)
         keeps = keeps & stays
@@ -314,7 +315,8 @@ class Motion:
         grown = change_at_points(*rows, dp)
         if materials.retentions is not None:
             of, pores = cut.pieces.point, materials.porosity(before)
-            full, empty = (materials.saturation(points, cut.to_pieces(at), of)[0] for at in (p, p_n))
+            heads = on_grid.heads
+            full, empty = (materials.saturation(points, cut.to_pieces(at + heads), of)[0] for at in (p, p_n))
             grown = full * grown + (full - empty) * pores[of] * np.exp(-dp / (2 * forms.bulk))
         grown = cut.mean(density * grown - came_here)
         none = materials.drainage(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)

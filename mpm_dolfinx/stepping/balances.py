@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.time_integration import Substep
-from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
+from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome, Shares
 from mpm_dolfinx.dynamics.step_error import motion_error
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.inertia import Flight, Inertia
@@ -50,6 +50,14 @@ class Start(NamedTuple):
     acting: list[Acting]
     renewed: int = 0
 
+    def begun(self, acting: Acting, gone: Sequence[Any] | None) -> Acting:
+        """Return what acts in a substep as it begins; gone: what loads returned of the last one."""
+        if not self.state.stage.inertia:
+            return acting
+        shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
+        before = gone or [None] * len(acting.loads)
+        return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
+
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
         """Return what gives velocities of points after the step, see `Mass.carried`; None without inertia."""
         if flight is None:
@@ -82,14 +90,21 @@ class Balances(NamedTuple):
         acceleration = self.inertia.acceleration(self.momentum.at)
         return flight.after(acceleration, float(substep.own * dt), float(substep.before * dt))
 
-    def outcome(self, state: State) -> Outcome:
-        """Return what conditions do to the bodies at the end of a step, see `State`."""
+    def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
+        """Return what passes open sides at the end of the substep, see `StorageProblem.passing`."""
+        return self.storage.passing() if self.storage else []
+
+    def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
+        """Return what conditions do to the bodies at the end of a step, see `State`.
+
+        passed, seconds: of the substeps, see `passing`, and the times, s, in which the last ones count.
+        """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
         out["outflows"] = self.storage.outflows() if self.storage else {}
         if self.storage and (runs := self.storage.run_off()):
             out["runoff"] = runs
-        return out
+        return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
         """Return what came to the cells in the step, see `StorageProblem.came`; None without fluid."""
@@ -167,7 +182,7 @@ def balances(
     if scene.storage is None:
         return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
-    fed = matrices.flow(start.state, weight, start.data, acting.t)
+    fed = matrices.flow(start.state, weight, start.data, acting.t, dt)
     lost = before and before.taken(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)

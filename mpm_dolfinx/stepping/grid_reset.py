@@ -108,6 +108,10 @@ class OnGrid(Keyed):
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
+            if quadrature.materials.retentions is not None:
+                lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
+                self._places = replace(self._places, lever=lever)
+                self.data = quadrature.data(cut, self._places, points)
             if quadrature.layered:
                 self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
 
@@ -147,12 +151,15 @@ class OnGrid(Keyed):
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
         if not state.stays:
             bulk = self._storage.bulk
-            carried = transport(state.pieces.potentials(bulk), self.cut.points, self.cut.pieces)
+            retentions, new = self._quadrature.materials.retentions, self.cut.pieces
+            rest = np.zeros(self.cut.grid.dim) if retentions is None else retentions.weight.value
+            old = state.pieces.potentials(bulk).less(rest)  # fluid at rest stays so: its S is not linear
+            carried = transport(old, self.cut.points, new) + new.x @ rest
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
             p = pressure_of(self._means(carried), bulk)
             water = self.pore_water(self.cut.points)
-            return p if water is None else water.level(water.of_cells(self._carried(state, carried)), p)
+            return p if water is None else water.level(water.of_cells(self._carried(state, carried)), p, self.heads)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.pieces.of_cell)
         return p[self.contents.filled]
@@ -266,7 +273,7 @@ class OnGrid(Keyed):
         if water is not None:
             mean = p_n[contents.filled]
             beyond = pi - mean[at]
-            pi = water.level(water.of_cells(mean[at]), mean, beyond)[at] + beyond
+            pi = water.level(water.of_cells(mean[at] + self.heads), mean, beyond)[at] + beyond
         slope = slope / (1 + pi / bulk)[:, None]
         values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)
         return [self.cut.to_pieces(rows) for rows in values]
@@ -359,6 +366,11 @@ class OnGrid(Keyed):
         rows = cut.to_cells(materials.retention_rows(points))
         slot = self.contents.slot(cut.cells)
         return PoreWater(partial(materials.saturations, rows), slot, store, pores, self._storage.bulk, self.scale)
+
+    @property
+    def heads(self) -> NDArray[np.float64]:
+        """By how much the pressures (m,) of pieces whose pores drain differ from their cells', Pa."""
+        return self._quadrature.materials.retentions.heads(self._places.lever)
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
@@ -539,7 +551,7 @@ class Assembled(Keyed):
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
-        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
+        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
         """Return what acts on the fluid, and what assembles the fluxes at u, called with whether a step begins.
 
@@ -555,6 +567,8 @@ class Assembled(Keyed):
             The pieces.
         t
             Time at which open sides have their pressures and fluxes, s.
+        dt
+            The step, s.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -562,7 +576,7 @@ class Assembled(Keyed):
         u = self._u
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
-        wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None)
+        wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
 

@@ -71,7 +71,7 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     water = on_grid.pore_water(points)
     if water is not None:
         offset = p - wanted[water.slot]
-        p = water.level(water.of_cells(wanted[water.slot]), wanted, offset)[water.slot] + offset
+        p = water.level(water.of_cells(wanted[water.slot] + on_grid.heads), wanted, offset)[water.slot] + offset
     p = cut.to_pieces(p)
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
     return PiecePressures(points.id[pieces.point], pieces.cell, pieces.fraction, p, pieces.x, 0 * pieces.x, bounds)

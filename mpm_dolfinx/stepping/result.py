@@ -15,7 +15,8 @@ from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.tables import data_frame, data_set
 from mpm_dolfinx.conditions.names import ByName
 
-OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", "energy")
+OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", "tool_velocity", "energy")
+OUTCOMES += ("runoff", "flowed", "ran_off", "ponded")
 """What conditions do to the bodies; those of the user's own may have others."""
 
 
@@ -134,11 +135,11 @@ class Result:
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        kinetic and elastic are those of the bodies; elastic is 0 where a law tells none.  The others count from the
-        start of the run: external is the work of all that acts, viscous that against quiet sides and terms of the
-        user's, internal that of the stresses; dissipated is what of this is not elastic, of wet bodies also what the
-        flow takes and water stores.  kinetic + elastic + dissipated + viscous - external stays as it is, but for what
-        the method loses.
+        kinetic and elastic are those of the bodies, and of free tools; elastic is 0 where a law tells none.  The others
+        count from the start of the run: external is the work of all that acts, viscous that against quiet sides and
+        terms of the user's, friction what slip on tools and between groups takes, internal that of the stresses;
+        dissipated is what of this is not elastic, of wet bodies also what the flow takes and water stores.  kinetic +
+        elastic + dissipated + viscous + friction - external stays as it is, but for what the method loses.
         """
         return self.outcome("energy")
 

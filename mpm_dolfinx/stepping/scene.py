@@ -103,8 +103,6 @@ class Scene:
         if velocity is not None:
             seeded = replace(seeded, data=moving(seeded, velocity, grid.base, grid.axisymmetric))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
-        if velocity is not None and scene.retentions is not None:
-            raise ValueError("inertia: not of soil whose pores drain (retention), must be left out")
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
@@ -197,6 +195,15 @@ class Scene:
             what += "gravity changes with time: must be given as Fluid(gravity=...)"
             warn(self.grid.comm, ConditionWarning, what, strength)
             self._told.add("gravity")
+
+    def rests_at(self, stage: Stage, t: float) -> None:
+        """Set the weight of the fluid by which pressures within a cell differ where pores drain, see `Retentions`.
+
+        Of a stage at the time, s, at which a step begins; where gravity changes the grid is reset in each step.
+        """
+        if self.materials.retentions is not None:
+            gravity = stage.gravity_at(t) if self.materials.conducts else None
+            self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def check(self, state: State) -> None:
         """Refuse what is no state of this scene: its conditions act on the materials of another one."""

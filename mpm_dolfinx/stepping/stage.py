@@ -159,6 +159,8 @@ class Stage:
         out["outflows"] = {name: values for one in self.feeding for name, values in one.unknown(value).items()}
         if runs := {name: values for one in self.feeding for name, values in one.dry(value).items()}:
             out["runoff"] = runs
+        for one in self.feeding:
+            out |= one.empty()
         for one in self.acting:
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values
@@ -173,6 +175,11 @@ class Stage:
             quantity: {name: outcome[quantity][name] if name in same else new for name, new in values.items()}
             for quantity, values in self.unknown(value).items()
         }
+
+    def kinetic(self, outcome: Outcome) -> float:
+        """Return the kinetic energy, J, of free tools by an outcome."""
+        velocity = outcome.get("tool_velocity", {})
+        return sum(self.named[name].mass / 2 * float(v @ v) for name, v in velocity.items() if name in self.named)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
@@ -264,13 +271,12 @@ def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
+        if isinstance(one, Tool) and one.free and not inertia:
+            raise ValueError(f"{name}: the tool has a mass, must be in a stage with inertia=True")
         if not inertia:
             continue
-        if isinstance(one, Contact):
-            raise ValueError(f"{name}: contacts of groups are quasi-static, must be left out with inertia")
-        if isinstance(one, Tool) and (one.grips or one.load is not None):
-            what = "a load, and no mass" if one.load is not None else "friction"
-            raise ValueError(f"{name}: the tool has {what}, must be smooth and moved as given with inertia")
+        if isinstance(one, Tool) and one.load is not None and not one.free:
+            raise ValueError(f"{name}: the tool has a load, and no mass, must have one with inertia")
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:

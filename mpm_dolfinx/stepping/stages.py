@@ -54,8 +54,10 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
     pieces = None
+    scene.rests_at(begun, 0.0)
     if scene.fluid:
-        pieces = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
+        placed = callable(scene.initial.pressure) or scene.materials.retentions is not None
+        pieces = pieces_at_start(scene, points) if placed else at_start(points)
     return State(
         t=0.0,
         points=_gripped(scene, begun, points),
@@ -97,6 +99,7 @@ def begin_stage(
     if new_quiet and before.inertia:
         raise ValueError(f"{next(iter(new_quiet))}: bodies had inertia before, must be quiet from its first stage on")
     state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
+    scene.rests_at(before, state.t)
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)

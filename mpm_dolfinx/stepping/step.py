@@ -21,6 +21,7 @@ from mpm_dolfinx.stepping.state import State
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in its substeps."""
     scene.check(state)
+    scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
@@ -48,32 +49,36 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
     start = set_up(scene, state, dt, how)
-    report = Report(renewed=start.renewed)
-    kept = Kept()
-    rates = []
+    report, kept = Report(renewed=start.renewed), Kept()
+    rates, passed = [], []
+    gone = None
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers
     flights, found = [flight_of(start)], []
-    for acting in start.acting:
+    for placed in start.acting:
+        acting = start.begun(placed, gone)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         as_reset = partial(on_grid.as_reset, state)
         rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
+        passed.append(both.passing())
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
+        gone = [one.flown(both.momentum.at) for one in acting.loads]
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers
     start.matrices.end_step()
-    at, outcome = both.momentum.at, both.outcome(state)
+    seconds = dt * np.array([acting.substep.before, acting.substep.own])
+    at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
     if found:
-        seconds = dt * np.array([acting.substep.before, acting.substep.own])
-        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], seconds, found)
+        kinetic = state.stage.kinetic(outcome)
+        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], kinetic, seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report

@@ -24,6 +24,8 @@ class StepControl:
         See `Report`: of the last step, over its length where the grid is reset.
     motion : J^(1/2)
         Largest motion since the run began, see `motion_error`; None where it is not asked for.
+    filled
+        Largest change of the water content in a step since the run began.
     """
 
     interval: float = 0.0
@@ -33,3 +35,4 @@ class StepControl:
     change: float = 0.0
     first: float = 0.0
     motion: float | None = None
+    filled: float = 0.0

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""Let a rough tool with a mass strike a block that slides on another one, on any number of processes."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([0, 0], [1.6, 1.2], [16, 12])
+blocks = [mpm.box(grid, [0.1, 0], [1.5, 0.43]), mpm.box(grid, [0.33, 0.43], [1.13, 0.77])]
+soil = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
+tool = mpm.Tool(mpm.HalfSpace((0, 0.775), (0, -1)), mass=50.0, velocity=(0.4, -0.5), friction=0.3)
+simulation = mpm.Simulation(
+    grid,
+    blocks,
+    [soil],
+    walls={"bottom": "xy"},
+    conditions=[tool, mpm.Contact(0, 1, friction=0.2)],
+    gravity=(1.0, -9.81),
+    inertia=True,
+    velocity=lambda x: np.stack([np.where(x[:, 1] > 0.43, 0.3, 0.0), 0 * x[:, 1]], axis=1),
+)
+result = simulation.run(0.05, 0.01, energies=True, progress=False)
+points = simulation.points
+parts = grid.comm.gather((points.id, points.x, points.data["velocity"], points.data["tool_shear"]))
+if parts:
+    ids, x, v, s = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    np.savez(
+        sys.argv[1],
+        x=x[order],
+        velocity=v[order],
+        shear=s[order],
+        forces=simulation.tool_forces.array,
+        tool=[simulation.tool_travel["tool"], simulation.outcome("tool_velocity")["tool"]],
+        energies=[of[-1] for of in result.energies.values()],
+        balance=result.balance,
+        counts=[len(part[0]) for part in parts],
+    )

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: MIT
+"""Bodies with inertia strike, slide, stick and roll, on one another and on tools; tools with a mass fall and bounce."""
+
+import numpy as np
+import pytest
+from meshes import box_mesh
+from test_inertia import Bar
+
+import mpm_dolfinx as mpm
+
+G = 9.81
+STIFF = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
+BAR = Bar(bulk=1 / 3, shear=0.5, grain_density=2.0, porosity=0.5)  # c = 1 m/s, rho = 1 kg/m^3, E = 1 Pa
+
+
+def mass(s):
+    return s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
+
+
+def of_centre(s, values):
+    m = mass(s)
+    return m @ values / m.sum()
+
+
+def balance(e):
+    """Return how far energies are out of balance, over the largest of them."""
+    total = sum(e[name] for name in ("kinetic", "elastic", "dissipated", "viscous", "friction")) - e["external"]
+    return np.abs(total - total[0]).max() / max(np.abs(values).max() for values in e.values())
+
+
+def bars(n, speed=0.05, drift=0.0):
+    """Return two bars, 1 m long, that fly towards each other, c dt = h = 1/n m, beside grid lines."""
+    h = 1 / n
+    count = 3 * n + round(2.6 * abs(drift) / h)
+    grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
+    gap, low = 0.1 * speed, 0.5 + 0.3 * h
+    both = [mpm.box(grid, [at, 0], [at + 1, h]) for at in (low - gap / 2, low + 1 + gap / 2)]
+
+    def velocity(x):
+        return np.stack([drift + np.where(x[:, 0] < low + 1, speed, -speed), 0 * x[:, 1]], axis=1)
+
+    contacts, walls = [mpm.Contact(0, 1)], {"bottom": "y", "top": "y"}
+    return mpm.Simulation(grid, both, [BAR], walls=walls, conditions=contacts, inertia=True, velocity=velocity)
+
+
+def test_two_bars_strike_and_exchange_their_velocities():
+    """Exact: the force is rho c V for 2 L / c, then the bars part as fast as they came."""
+    n, speed = 40, 0.05
+    s = bars(n, speed)
+    force = []
+    for _ in range(round(2.6 * n)):
+        s.step(1 / n)
+        force.append(abs(s.tool_forces.array[0, 0]) * n / speed)
+    force, v, m = np.array(force), s.points.data["velocity"][:, 0], mass(s)
+    first = s.points.id < s.points.id.max() // 2 + 1
+    left, right = (m[on] @ v[on] / m[on].sum() for on in (first, ~first))
+    assert (right - left) / (2 * speed) > 0.97 and abs(m @ v) < 1e-14
+    assert np.median(force[force > 0.5]) == pytest.approx(1.0, rel=1e-3)
+    assert (force > 0.5).sum() / n == pytest.approx(2.0, rel=0.03)
+
+
+def incline(angle, aslant, friction=0.3, speed=0.0, n=4, length=0.5):
+    """Return a stiff block, 0.3 x 0.2 m, on an incline along the grid or at 30 degrees to it, and its direction."""
+    h, turn = 0.2 / n, -np.pi / 6 if aslant else 0.0
+    e = np.array([np.cos(turn), np.sin(turn)])
+    normal = np.array([-e[1], e[0]])
+    width, height = (length + 0.6) * e[0] + 0.2, 0.5 + (length + 0.4) * abs(e[1])
+    cells = np.ceil(np.array([width, height]) / h).astype(int)
+    grid = mpm.Grid([0, 0], (cells * h).tolist(), cells.tolist())
+    foot = np.array([0.15, 0.37 * h if not aslant else cells[1] * h - 0.37])
+    if aslant:
+        mesh = box_mesh(
+            "quad", [3 * n, 2 * n], [0, 0], [0.3, 0.2], place=lambda X: foot + X[:, :1] * e + X[:, 1:] * normal
+        )
+        block = mpm.from_mesh(grid, mesh)
+    else:
+        block = mpm.box(grid, foot, foot + np.array([0.3, 0.2]))
+    floor = mpm.Tool(mpm.HalfSpace(tuple(foot), tuple(normal)), friction=friction)
+    gravity = G * (np.sin(angle) * e - np.cos(angle) * normal)
+    options = {"walls": {}, "conditions": [floor], "gravity": gravity, "inertia": True, "velocity": speed * e}
+    return mpm.Simulation(grid, [block], [STIFF], **options), e
+
+
+@pytest.mark.parametrize("aslant", [False, True])
+def test_a_block_slides_down_a_rough_incline_as_fast_as_it_should(aslant):
+    angle, t = np.pi / 6, 0.5
+    s, e = incline(angle, aslant)
+    start = of_centre(s, s.points.x)
+    s.run(t, 0.02, progress=False)
+    a = G * (np.sin(angle) - 0.3 * np.cos(angle))
+    assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(a * t**2 / 2, rel=2e-3)
+    assert of_centre(s, s.points.data["velocity"]) @ e == pytest.approx(a * t, rel=2e-3)
+
+
+@pytest.mark.parametrize("aslant", [False, True])
+def test_friction_brakes_a_block_and_takes_its_energy(aslant):
+    """Exact: it stops after v^2 / (2 mu g)."""
+    s, e = incline(0.0, aslant, speed=1.0, length=0.3)
+    start = of_centre(s, s.points.x)
+    energies = s.run(0.4, 0.02, energies=True, progress=False).energies
+    assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(0.169894666, rel=2e-3)
+    assert abs(of_centre(s, s.points.data["velocity"]) @ e) < 0.02
+    assert energies["friction"][-1] == pytest.approx(energies["kinetic"][0], rel=0.01) and balance(energies) < 0.01
+
+
+def test_a_block_that_friction_holds_stays():
+    s, e = incline(np.arctan(0.25), False)
+    start = of_centre(s, s.points.x)
+    s.run(0.5, 0.05, progress=False)
+    assert abs((of_centre(s, s.points.x) - start) @ e) < 5e-3  # while it settles
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.3, 0.1])
+def test_a_disc_rolls_down_an_incline_or_slips(friction):
+    """Exact: it rolls by 2/3 g sin b where mu >= tan b / 3; else it slides by g (sin b - mu cos b)."""
+    pytest.importorskip("gmsh")
+    angle, turn, radius, t = np.pi / 6, -np.pi / 6, 0.15, 0.4
+    e = np.array([np.cos(turn), np.sin(turn)])
+    normal = np.array([-e[1], e[0]])
+    grid = mpm.Grid([0, 0], [0.9, 0.75], [30, 25])
+    foot = np.array([0.21, 0.39])
+    around = np.linspace(0, 2 * np.pi, 128, endpoint=False)
+    disc = mpm.polygon(grid, foot + radius * (normal + np.stack([np.cos(around), np.sin(around)], axis=1)), sides="rim")
+    floor = mpm.Tool(mpm.HalfSpace(tuple(foot), tuple(normal)), friction=friction)
+    gravity = G * (np.sin(angle) * e - np.cos(angle) * normal)
+    s = mpm.Simulation(grid, [disc], [STIFF], walls={}, conditions=[floor], gravity=gravity, inertia=True)
+    start = of_centre(s, s.points.x)
+    s.run(t, 0.01, progress=False)
+    a = max(2 / 3 * G * np.sin(angle), G * (np.sin(angle) - friction * np.cos(angle)))
+    assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(a * t**2 / 2, rel=0.01)
+    assert of_centre(s, s.points.data["velocity"]) @ e == pytest.approx(a * t, rel=0.01)
+
+
+def test_a_tool_that_pushes_ever_faster_has_its_acceleration_from_the_first_step_on():
+    grid = mpm.Grid([0, 0], [1.5, 0.4], [15, 4])
+    block = mpm.box(grid, [0.23, 0.1], [0.53, 0.3])
+    paddle = mpm.Tool(mpm.HalfSpace((0.23, 0), (1, 0)), displacement=lambda t: (0.8 * t**2, 0))
+    s = mpm.Simulation(grid, [block], [STIFF], walls={}, conditions=[paddle], inertia=True)
+    result = s.run(0.5, 0.05, energies=True, progress=False)
+    assert of_centre(s, s.points.data["velocity"])[0] == pytest.approx(0.8, rel=5e-3)
+    assert result.energies["external"][-1] == pytest.approx(mass(s).sum() * 0.8**2 / 2, rel=0.01)
+
+
+def struck(M, V):
+    """Return when a mass M leaves a bar of unit length, stiffness and density that it strikes, and how fast.
+
+    Exact, along characteristics: waves run down the bar from below the mass and come back from its fixed foot.
+    """
+    n = 4000
+    dt, down, v = 1 / n, np.zeros(100 * n), V
+    for i in range(100 * n):
+        back = down[i - 2 * n] if i >= 2 * n else 0.0
+        if i > n and v + 2 * back < 0:
+            return i * dt, -v
+        v = (v * (1 - dt / 2 / M) - 2 * dt * back / M) / (1 + dt / 2 / M)
+        down[i] = v + back
+    raise AssertionError("it stays")
+
+
+def hammer(n, M=0.7, speed=0.02, gap=0.003):
+    """Return a bar, 1 m long, on a fixed foot, and a free tool that falls on it."""
+    h = 1 / n
+    grid = mpm.Grid([0, 0], [h, 1.5], [1, round(1.5 / h)])
+    bar = mpm.box(grid, [0, 0], [h, 1])
+    tool = mpm.Tool(mpm.HalfSpace((0, 1 + gap), (0, -1)), mass=M * h, velocity=(0, -speed))
+    walls = {"bottom": "y", "left": "x", "right": "x"}
+    return mpm.Simulation(grid, [bar], [BAR], walls=walls, conditions=[tool], inertia=True)
+
+
+def test_a_hammer_comes_back_as_fast_as_it_should():
+    t, back = struck(0.7, 1.0)
+    s = hammer(10)
+    e = s.run(np.ceil(20 * (t + 0.4)) / 20, 0.05, energies=True, progress=False).energies
+    assert s.outcome("tool_velocity").array[0][1] / 0.02 == pytest.approx(back, rel=0.015)
+    assert e["kinetic"][0] == pytest.approx(0.7 * 0.1 * 0.02**2 / 2)
+
+
+@pytest.mark.slow
+def test_a_heavy_hammer_keeps_its_energy_to_a_hundredth():
+    """What is lost is that of the bar's first half cell, which the hammer meets at once."""
+    t, back = struck(2.0, 1.0)
+    s = hammer(20, 2.0)
+    e = s.run(np.ceil(40 * (t + 0.4)) / 40, 0.025, energies=True, progress=False).energies
+    assert s.outcome("tool_velocity").array[0][1] / 0.02 == pytest.approx(back, rel=0.015)
+    assert balance(e) < 0.01
+
+
+def test_a_free_tool_falls_as_stones_do_and_goes_along_its_guide():
+    grid = mpm.Grid([0, 0], [1, 1], [4, 4])
+    body = mpm.box(grid, [0, 0], [1, 0.3])
+    ball = mpm.Ball((0.5, 20.0), 0.2)
+    tools = [
+        mpm.Tool(ball, mass=3.0, velocity=(0.5, 1.0)),
+        mpm.Tool(ball, mass=2.0, direction=(1, -1), load=lambda t: 4 * t),
+    ]
+    walls, gravity = {"bottom": "y", "left": "x", "right": "x"}, (0, -G)
+    s = mpm.Simulation(grid, [body], [STIFF], walls=walls, conditions=tools, gravity=gravity, inertia=True)
+    e = s.run(0.5, 0.1, energies=True, progress=False).energies
+    (one, other), (v, w) = s.tool_travel.array, s.outcome("tool_velocity").array
+    assert one == pytest.approx([0.25, 0.5 - G / 8]) and v == pytest.approx([0.5, 1 - G / 2])
+    way, speed = 0.5**3 / 3 + G / np.sqrt(2) / 8, 0.25 + G / np.sqrt(8)
+    along = np.array([1, -1]) / np.sqrt(2)
+    assert other == pytest.approx(way * along, rel=3e-3) and w == pytest.approx(speed * along, rel=1e-6)
+    assert balance(e) < 5e-3
+
+
+def sledge(mirror=1, **options):
+    """Return a rough free tool that is thrown along a block of soil, and rests on it."""
+    grid = mpm.Grid([0, 0], [1.2, 0.6], [12, 6])
+    body = mpm.box(grid, [0, 0], [1.2, 0.43])
+    shape = mpm.HalfSpace((0, 0.43), (0, -1))
+    tool = mpm.Tool(shape, mass=100.0, velocity=(mirror * 0.3, 0), friction=0.2)
+    options = {"walls": {"bottom": "xy", "left": "x", "right": "x"}, "gravity": (0, -G), "inertia": True, **options}
+    return mpm.Simulation(grid, [body], [STIFF], conditions=[tool], **options)
+
+
+def test_friction_brakes_a_free_tool_on_either_side_alike():
+    s, other = sledge(), sledge(-1)
+    for one in (s, other):
+        one.run(0.1, 0.02, progress=False)
+    v, w = (one.outcome("tool_velocity").array[0] for one in (s, other))
+    assert w == pytest.approx(v * [-1, 1], abs=1e-9)
+    assert 0.05 < v[0] < 0.3
+
+
+def test_a_resumed_strike_has_the_same_bits(tmp_path):
+    one, other = sledge(), sledge()
+    first = one.run(0.06, 0.02, energies=True, checkpoint=mpm.Checkpoint(tmp_path / "strike.npz"), progress=False)
+    resumed = mpm.resume(other, tmp_path / "strike.npz")
+    for s, result in ((one, first), (other, resumed)):
+        s.run(0.12, 0.02, energies=True, after=result, progress=False)
+    assert np.array_equal(one.points.x, other.points.x)
+    assert np.array_equal(one.points.data["velocity"], other.points.data["velocity"])
+    assert np.array_equal(one.outcome("tool_velocity").array[0], other.outcome("tool_velocity").array[0])
+    assert np.array_equal(one.tool_travel.array[0], other.tool_travel.array[0])
+
+
+def test_bars_that_drift_strike_alike(monkeypatch):
+    """A uniform velocity, by whole cells a step, changes nothing else; later the filter goes with cells crossed."""
+    monkeypatch.setattr("mpm_dolfinx.mechanics.inertia.RELAXES", 0.0)
+    still, moves = bars(8), bars(8, drift=2.0)
+    still.step(1 / 8), moves.step(1 / 8)
+    assert still.tool_forces.array[0, 0] != 0
+    assert moves.tool_forces.array == pytest.approx(still.tool_forces.array, abs=1e-10)
+    slip = moves.points.data["velocity"] - still.points.data["velocity"]
+    assert slip == pytest.approx(np.broadcast_to([2.0, 0.0], slip.shape), abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"mass": 0.0}, "mass"),
+        ({"velocity": (0, 1)}, "velocity"),
+        ({"mass": 1.0, "displacement": lambda t: (0, t)}, "displacement"),
+        ({"mass": 1.0, "load": 1.0}, "direction"),
+    ],
+)
+def test_tools_that_are_neither_free_nor_given_are_refused(options, said):
+    with pytest.raises(ValueError, match=said):
+        mpm.Tool(mpm.Ball((0, 0), 1.0), **options)
+
+
+def test_free_tools_are_refused_without_inertia():
+    with pytest.raises(ValueError, match="inertia=True"):
+        sledge(inertia=False)
+
+
+@pytest.mark.slow
+def test_a_block_on_a_base_that_shakes_moves_by_steps_as_newmark_s():
+    """Newmark (1965): a rigid block slides down while its base pulls away faster than friction can follow."""
+    angle, mu, omega, t_end = np.radians(15), 0.4, 4 * np.pi, 1.5
+    size = 0.5 * G / omega**2
+    dt, v, way = 1e-5, 0.0, 0.0
+    for t in np.arange(0, t_end, dt):
+        drive, most = G * np.sin(angle) - 0.5 * G * np.cos(omega * t), mu * G * np.cos(angle)
+        slips = v != 0 or abs(drive) > most
+        then = v + dt * (drive - most * np.sign(v if v else drive)) * slips
+        v = 0.0 if v * then < 0 else then
+        way += v * dt
+    s, _ = incline(0.0, False, friction=mu, length=0.9)
+    block, floor = s.scene.bodies[0], mpm.HalfSpace((0, 0.37 * 0.05), (0, 1))
+    base = mpm.Tool(floor, displacement=lambda t: (size * (1 - np.cos(omega * t)), 0.0), friction=mu)
+    gravity = G * np.array([np.sin(angle), -np.cos(angle)])
+    s = mpm.Simulation(s.grid, [block], [STIFF], walls={}, conditions=[base], gravity=gravity, inertia=True)
+    start = of_centre(s, s.points.x)[0]
+    energies = s.run(t_end, 0.02, energies=True, progress=False).energies
+    slid = of_centre(s, s.points.x)[0] - start - size * (1 - np.cos(omega * t_end))
+    assert slid == pytest.approx(way, rel=0.04) and balance(energies) < 0.01
