@@ -104,10 +104,9 @@ class Slump:
 def slump(cells: int, steps: int, barrier: bool) -> Slump:
     """Let the bank lose its cohesion in so many steps, and come to rest."""
     s, out, dt = bank(cells, barrier), Slump(), DURATION / steps
-    start = s.points.x
 
     def look(s: mpm.Simulation) -> None:
-        corners, moved = s.points.corners, np.linalg.norm(s.points.x - start, axis=1)
+        corners, moved = s.points.corners, np.linalg.norm(s.points.displacement, axis=1)
         force, between, at = np.zeros(3), (0.0, 0.0), corners[np.abs(corners[..., 0] - WALL) < s.grid.h[0] / 2]
         depth = float(at[:, 1].max(initial=0))
         if barrier and s.t > 0:

@@ -122,6 +122,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
     load = mpm.Pressure("right", lambda t: PRESSURE * (min(1, t) if begin else 1), region=top)
     acting = {"walls": WALLS, "conditions": [load, bar], "initial_stress": stress}
+    acting["numerics"] = mpm.Numerics(renewal=False)  # clay is seeded anew instead
     simulation = mpm.Simulation(grid, [body], [soil], **acting)
     if begin:
         simulation.run(begin, begin, progress=False)
