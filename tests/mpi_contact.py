@@ -34,7 +34,7 @@ simulation.stage(
         mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5))),
     ],
 )
-result = simulation.run(1.0, 0.5, progress=False)
+result = simulation.run(1.0, 0.125, progress=False)
 points = simulation.points
 data = (points.data["contact_shear"], points.data["contact_pressure"])
 parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, *data))

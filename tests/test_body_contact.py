@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from layers import compliance, errors
 
 import mpm_dolfinx as mpm
 
@@ -273,6 +274,31 @@ def test_what_are_no_contacts_is_refused():
     )
     with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
         mpm.factor_of_safety(s)
+
+
+@pytest.mark.parametrize(("steps", "error"), [(1, 0.06), pytest.param(10, 0.08, marks=pytest.mark.slow)])
+def test_curved_bodies_press_each_other_with_the_exact_pressures(steps, error):
+    """14 cells over the half-width, in one step and as the contact grows; the upper body is curved, and held on top."""
+    cells, R, L, nu = 16, 200.0, 4.0, 0.3
+    top = L + 0.3 / cells
+    grid = mpm.Grid([0, 0], [L, 2 * L + 2], [round(L * cells), round((2 * L + 2) * cells)])
+
+    def bend(x):
+        return x + np.column_stack([0 * x[:, 0], (1 - (x[:, 1] - top) / L) * x[:, 0] ** 2 / (2 * R)])
+
+    bodies = [mpm.box(grid, [0, 0], [L, top]), mpm.mapped(grid, mpm.box(grid, [0, top], [L, top + L]), bend)]
+    above = ([0, top + L / 2], [L, 2 * L + 2])
+    held = mpm.Displacement("top", lambda t, X: (0, -0.0043 * t), components="y", region=above)
+    soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=[held, mpm.Contact(0, 1)])
+    s.run(1.0, 1.0 / steps)
+    layers = [compliance(L, top, E, nu, rough=True), compliance(L, L, E, nu, rough=False)]
+    pressure, half_width = errors(
+        s.points.x[:, 0], s.points.data["contact_pressure"], L, R, layers, 2 * abs(s.tool_forces["contact"][1])
+    )
+    assert pressure < error
+    assert abs(half_width) < 0.01
 
 
 def test_a_block_slides_off_the_edge_of_another():

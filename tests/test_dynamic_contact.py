@@ -287,3 +287,15 @@ def test_a_block_on_a_base_that_shakes_moves_by_steps_as_newmark_s():
     energies = s.run(t_end, 0.02, energies=True, progress=False).energies
     slid = of_centre(s, s.points.x)[0] - start - size * (1 - np.cos(omega * t_end))
     assert slid == pytest.approx(way, rel=0.04) and balance(energies) < 0.01
+
+
+def test_a_free_tool_in_axisymmetry_goes_along_the_axis():
+    grid = mpm.Grid([0, 0], [1, 1], [5, 5], axisymmetric=True)
+    body, ball = mpm.box(grid, [0, 0], [1, 0.43]), mpm.Ball((0, 0.9), 0.3)
+    options = {"walls": {"bottom": "xy", "right": "x"}, "gravity": (0, -G), "inertia": True}
+    tool = mpm.Tool(ball, mass=200.0, velocity=(0, -1))
+    s = mpm.Simulation(grid, [body], [STIFF], conditions=[tool], **options)
+    s.run(0.1, 0.05, progress=False)
+    assert s.tool_travel["tool"] == pytest.approx([0, -0.1 - G * 0.1**2 / 2])
+    with pytest.raises(ValueError, match="along the axis"):
+        mpm.Simulation(grid, [body], [STIFF], conditions=[mpm.Tool(ball, mass=1.0, velocity=(1, 0))], **options)

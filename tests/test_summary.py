@@ -96,6 +96,8 @@ BENCHMARK = {
     "rain": set(),
     "pressure that follows the surface": {"tractions", "pressures"},
     "inertia": {"inertia"} | SECOND,
+    "inertia of wet soil, two substeps in both": {"inertia", "weight of the fluid"},
+    "free tool that touches nothing": {"tools"},
     "quiet side": {"quiet sides"},
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},

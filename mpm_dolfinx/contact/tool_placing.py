@@ -95,6 +95,8 @@ class Tools:
             tool.check(grid.dim)
             if grid.axisymmetric and tool.along(grid.dim)[0]:
                 raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
+            if grid.axisymmetric and tool.begins(grid.dim)[0]:
+                raise ValueError(f"Tool: velocity = {line(tool.velocity)}, must be along the axis in axisymmetry")
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)

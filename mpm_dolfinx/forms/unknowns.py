@@ -109,14 +109,6 @@ def zero(A: PETSc.Mat) -> None:
         A.zeroEntries()
 
 
-def renew(A: PETSc.Mat) -> None:
-    """Let PETSc look at the pattern of a matrix anew, after sums with others.
-
-    It orders unknowns by which rows had the same pattern before the sums: LU factors of such an order are wrong.
-    """
-    A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
-
-
 def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has dropped on all processes, together: PETSc keeps them until it is asked.
 

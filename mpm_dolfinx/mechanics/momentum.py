@@ -29,7 +29,7 @@ from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
 from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints
-from mpm_dolfinx.forms.unknowns import Unknowns, matrix, renew, sum_ghosts, zero
+from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
@@ -553,8 +553,6 @@ class MomentumProblem:
                 K.axpy(1.0, zeros, pattern.UNKNOWN)
             if (coupling := one.coupling(self.at)) is not None:
                 K.axpy(1.0, coupling, pattern.SUBSET_NONZERO_PATTERN)
-        if first:
-            renew(K)
         shares = np.broadcast_to(firmness, self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():

@@ -79,6 +79,14 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
     return ksp
 
 
+def renew(A: PETSc.Mat) -> None:
+    """Let PETSc look at the pattern of a matrix anew, after sums with others.
+
+    It orders unknowns by which rows had the same pattern before the sums: LU factors of such an order are wrong.
+    """
+    A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
+
+
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the iterations of a solver's last solve; NotConverged where it broke off.
 

@@ -31,7 +31,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
-from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
+from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, renew, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
 from mpm_dolfinx.solve.multigrid import multigrid_solver
 from mpm_dolfinx.solve.petsc_options import using
@@ -192,7 +192,10 @@ class LinearSolvers:
         """
         kept = kept or Kept()
         with Timer("mpm: tangent"):
+            first = not self._momentum.K.assembled
             momentum.assemble_tangent(data, firmness)
+            if first and not self.plan.symmetric:
+                renew(self._momentum.K)
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces)
         with Timer("mpm: factorisation"), using(self.scheme.petsc_options, self._unread):

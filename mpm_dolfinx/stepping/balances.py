@@ -137,12 +137,19 @@ def flight_of(start: Start) -> Flight | None:
     return Flight(v, v)
 
 
-def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
-    """Return displacements (unknowns,), m, if bodies that yield moved on as in the substep before, or the last step.
+def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
+    """Return whether Newton's method may begin where bodies go on as before: these yield, or touch without inertia."""
+    momentum = scene.momentum
+    return not momentum.elastic or (momentum.inertia is None and any(one.touches for one in loads))
 
-    A local array, None where that is not known.
+
+def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
+    """Return displacements (unknowns,), m, if bodies moved on as in the substep before, or the last step.
+
+    A local array, None where that is not known, or of no use: see `leads`.
     """
-    if substep.before > 0.0 and not scene.momentum.elastic:
+    substep = acting.substep
+    if substep.before > 0.0 and leads(scene, acting.loads):
         return substep.end / substep.own * scene.momentum.u.x.array
     velocity = start.state.velocity if substep.before == 0.0 else None
     return None if velocity is None else substep.end * start.dt * velocity
@@ -168,7 +175,7 @@ def balances(
     matrices = start.matrices
     dt = start.dt
     when = When(acting.t, substep.end * dt, acting.gravity, substep.own * dt, substep.before / substep.own)
-    options = {"goes_on": going_on(scene, start, substep), "held": start.state.held, "yielded": start.yielded}
+    options = {"goes_on": going_on(scene, start, acting), "held": start.state.held, "yielded": start.yielded}
     inertia, u = None, None
     loads = acting.loads
     if flight is not None:

@@ -83,8 +83,8 @@ class State:
     begins
         Whether no step of the stage has been taken.
     velocity : (unknowns,), m/s
-        Of the nodes of this process in the last step, ghosts included: where Newton's method may begin in soil that
-        yields.  None before the first step, and without such soil.
+        Of the nodes of this process in the last step, ghosts included: where Newton's method may begin where bodies
+        yield or touch.  None before the first step, and elsewhere.
     held : (unknowns,), N
         Forces on the nodes of this process, ghosts included, that hold what the scheme's error leaves out of balance of
         an initial stress; None without, once a stage begins, and once bodies have moved so far that the grid is reset.

@@ -13,7 +13,7 @@ from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.dynamics.energies import after
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
-from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, left
+from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, leads, left
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -51,17 +51,15 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
-    gone = None
-    state = start.state
-    on_grid = start.on_grid
-    solvers = start.matrices.solvers
+    state, gone = start.state, None
+    on_grid, solvers = start.on_grid, start.matrices.solvers
     flights, found = [flight_of(start)], []
     for placed in start.acting:
         acting = start.begun(placed, gone)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
-        as_reset = partial(on_grid.as_reset, state)
-        rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
+        problem = both.momentum, both.storage, partial(on_grid.as_reset, state)
+        rates.append(solve_substep(solvers, *problem, key, report, kept))
         passed.append(both.passing())
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
@@ -73,11 +71,10 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start.matrices.end_step()
     seconds = dt * np.array([acting.substep.before, acting.substep.own])
     at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
-    loads = [one.ended(at) for one in acting.loads]
-    end = state.t + dt, loads, both.came(rates[-1]), report
+    end = state.t + dt, [one.ended(at) for one in acting.loads], both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
-    velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
-    now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
+    velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
+    now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
         kinetic = state.stage.kinetic(outcome)
         outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], kinetic, seconds, found)
