@@ -234,20 +234,20 @@ class Scene:
         used = self.numerics.renewal and self.numerics.quadrature == "domain" and self.materials.evolves
         return Renewal(grid, self.bodies, self.materials) if plane and dry and used else None
 
-    def renewed(self, state: State) -> tuple[State, int]:
-        """Return a state some of whose domains are renewed before the grid is reset, and how many were.
+    def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
+        """Return a state for a reset of the grid, with points at their owners, and how many domains were renewed.
 
-        On several processes the first one has all points afterwards.
+        renew: whether any may be.
         """
-        if self._renewal is None or state.stay is not None:
-            return state, 0
+        if self._renewal is None or state.stay is not None or not renew:
+            return state.at_owners(self.grid), 0
 
         def make() -> tuple[MaterialPoints, int]:
             with Timer("mpm: renew domains"):
                 return self._renewal.renewed(state.points, state.stage, state.watched)
 
         points, count = self._renewed((*state.points.arrays, state.stage), make, self.grid.comm)
-        return (replace(state, points=points) if count else state), count
+        return (replace(state, points=points) if count else state).at_owners(self.grid), count
 
     def assembled(
         self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool

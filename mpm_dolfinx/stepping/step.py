@@ -27,8 +27,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
     if dt > 0:
         scene.look_at([start, *gravity])
-    state, renewed = scene.renewed(state) if dt > 0 else (state, 0)
-    state = state if state.stays else state.at_owners(scene.grid)
+    state, renewed = (state, 0) if state.stays else scene.for_reset(state, dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
