@@ -21,6 +21,7 @@ import cycles
 import footing
 import helpers
 import infiltration
+import mpi_renewal
 
 
 def bent(h: float, nu: float = 0.0) -> dict[str, float]:
@@ -48,6 +49,17 @@ def strip(cells: int) -> dict[str, float]:
     from test_footing import rough_strip
 
     return {"load": rough_strip(cells, "displacement")}
+
+
+def flowing(cells: int) -> dict[str, float]:
+    """A disc that goes into clay whose domains are renewed: its load."""
+    from mpm_dolfinx.stepping import renewal
+
+    before, renewal.LONGEST = renewal.LONGEST, 0.6
+    simulation = mpi_renewal.pushed(cells)
+    simulation.run(0.06, 0.08 / cells, progress=False)
+    renewal.LONGEST = before
+    return {"load": float(simulation.tool_forces["tool"][1])}
 
 
 def slope(cells: int) -> dict[str, float]:
@@ -84,6 +96,7 @@ SCENES = {
     "strip": (strip, 5, 9),
     "slope": (slope, 6, 12),
     "dry": (wetted, 25, 50),
+    "flow": (flowing, 8, 16),
 }
 """Scenes with their cells: those in which a number is varied, and finer ones."""
 

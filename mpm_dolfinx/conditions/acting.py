@@ -303,6 +303,8 @@ class Acting:
     """Whether the tangent is the same at all displacements."""
     surfaces: Sequence[Surface] = ()
     """Faces on which they act; found together, these are cut once."""
+    outside: Surface | None = None
+    """Faces that tools may meet."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Conditions that hold faces, these faces, and the axes along which."""
 

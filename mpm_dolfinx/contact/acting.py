@@ -66,6 +66,7 @@ class ToolsOfStage(Touching):
         held = [(hold, faces) for hold, faces, _ in held_faces(setting)]
         found = Tools(setting.grid, setting.materials, tools, setting.sides.all(), held)
         super().__init__(setting, tuple(tools), found)
+        self.outside = found.faces
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return forces and moments of this value, and that nothing has pushed them."""

@@ -345,7 +345,7 @@ class Tools:
         while over_all(comm, len(on)):
             at = y[on] + gone[on, None] * along[on]
             gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
-            inside = x[1][on[gap < 0]][:1]
+            inside = x[1][on[gap < -LEFT * h]][:1]  # middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
             gone[on] += np.maximum(gap, STRIDE * h)

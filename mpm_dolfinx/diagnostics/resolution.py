@@ -20,6 +20,7 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
+from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
 """Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
@@ -51,7 +52,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
     """Return the bodies in a lexicographic cell, and its midpoint (d,), m; on all processes together."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
-    own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
+    own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
     return found, grid.base + grid.places(np.array(np.unravel_index(cell % grid.cells, grid.shape)), 0.5)
 

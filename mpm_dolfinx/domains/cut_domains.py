@@ -15,6 +15,7 @@ from mpm_dolfinx.base.caching import Keyed
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.domains.bending import followed
+from mpm_dolfinx.domains.renewed_faces import PARENT, RenewedFaces, renewed_faces
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
@@ -47,7 +48,7 @@ class Patches:
         of the face.
     """
 
-    def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share):
+    def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
         self._faces = faces
         self.here = here
         self.at = at
@@ -55,7 +56,12 @@ class Patches:
         self.cell = cell
         self.x = x
         self._grid = grid
-        self._share0 = share * faces.area0[here]
+        self._renewed = renewed
+        area0 = faces.area0[here]
+        self._whole0, self._face = faces.whole0[here], faces.face[here]
+        if renewed is not None:
+            area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
+        self._share0 = share * area0
         self.base = grid.base
         """From which places count, see `Grid`."""
         around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
@@ -65,7 +71,8 @@ class Patches:
     @cached_property
     def X(self) -> NDArray[np.float64]:
         """Reference positions (n, d), m."""
-        return self._faces.reference(self.here, self._xi)
+        X = self._faces.reference(self.here, self._xi)
+        return X if self._renewed is None else self._renewed.reference(X, self._xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the positions (n, d), m, from which displacements count."""
@@ -77,10 +84,10 @@ class Patches:
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""
-        share = self._share0 / self._faces.whole0[self.here]
+        share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
-        return face_vectors(points.corners[self.at], self._faces.face[self.here]) * share[:, None]
+        return face_vectors(points.corners[self.at], self._face) * share[:, None]
 
 
 class CutDomains(Keyed):
@@ -181,9 +188,12 @@ class CutDomains(Keyed):
         columns = ((faces.id, faces.face, faces.xi, faces.skew, np.arange(len(faces))) for faces in several)
         ids, number, xi, skew, row = map(np.concatenate, zip(*columns, strict=True))
         here, at = self.points.find(ids)
+        number, xi = number[here], xi[here]
+        renewed = renewed_faces(self.points, several) if PARENT in self.points.data else None
+        if renewed is not None:
+            here, at = np.concatenate([here, renewed.row]), np.concatenate([at, renewed.at])
+            number, xi = np.concatenate([number, renewed.face]), np.concatenate([xi, renewed.xi])
         corners = self.points.corners[at]
-        number = number[here]
-        xi = xi[here]
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
@@ -196,8 +206,12 @@ class CutDomains(Keyed):
         cell = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.repeat(np.arange(len(several)), list(map(len, several)))[here][face]
-        own = (np.flatnonzero(surface == k) for k in range(len(several)))
-        return [Patches(self.grid, faces, *(v[o] for v in rows)) for faces, o in zip(several, own, strict=True)]
+        out = []
+        for k, faces in enumerate(several):
+            own = np.flatnonzero(surface == k)
+            anew = renewed and renewed.of(face[own] - (len(here) - len(renewed.row)))
+            out.append(Patches(self.grid, faces, *(v[own] for v in rows), anew))
+        return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""

@@ -15,7 +15,7 @@ from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import centroids, edges
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 
 
 def fitted_at(
@@ -52,9 +52,9 @@ def fitted_at(
     X, x, rest, now, material = np.split(over_all(comm, own), np.cumsum([d, d, d * d, d * d]), axis=1)
     rest, now = (frame.reshape(m, d, d) for frame in (rest, now))
     rest[~rest.any(axis=(1, 2))] = np.eye(d)
-    middle, last = centroids(points.reference), np.cumsum(sizes)
+    middle, last = centroids(points.reference), np.cumsum([0, *sizes])
     probe, row = _near(middle, X, RADIUS * np.abs(np.linalg.inv(rest)).sum(axis=2).max(axis=1))
-    body, own_body = (np.searchsorted(last, ids, side="right") for ids in (points.id[row], id[probe]))
+    body, own_body = (body_of(ids, last) for ids in (points.id[row], id[probe]))
     weight = near(np.einsum("rij,rj->ri", rest[probe], middle[row] - X[probe]))
     weight = weight * ((body == own_body) & (points.material[row] == material[probe, 0]))
     probe, row, weight = (values[weight > 0] for values in (probe, row, weight))

@@ -22,6 +22,7 @@ from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
@@ -174,20 +175,20 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
     """Return the state in a file, all of it; ValueError where it is none of the simulation's."""
     now, dim = simulation.state, simulation.grid.dim
     wet, damaged = simulation.scene.fluid is not None, f"{file}: is cut short or damaged"
-    ids = simulation.scene.all_ids(now.stage.present)
+    ids, total = simulation.scene.all_ids(now.stage.present), sum(map(len, simulation.bodies))
     try:
-        points = _points(_part(arrays, "points/"), now.points, ids)
+        points = _points(_part(arrays, "points/"), now.points, ids, total)
         stay = None
         pieces = None
         of_stay = _part(arrays, "stay/")
         if of_stay:
             keeps = of_stay.pop("keeps", None)
-            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), keeps)
-            if keeps is not None and (keeps.dtype != bool or keeps.shape != ids.shape):
+            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids, total), keeps)
+            if keeps is not None and (keeps.dtype != bool or keeps.shape != points.id.shape):
                 raise ValueError(f"stay/keeps: {keeps.dtype} of shape {keeps.shape}")
         if wet:
             own = _part(arrays, "pieces/")
-            _check_pieces(own, ids, dim)
+            _check_pieces(own, points.id, dim)
             leaves = dict.fromkeys(LEAVE) if stay is not None and stay.keeps is None else {}
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
@@ -263,9 +264,15 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
     return out
 
 
-def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64]) -> MaterialPoints:
-    """Return points of these ids from arrays as those of others; ValueError where they are not."""
+def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64], total: int) -> MaterialPoints:
+    """Return points of these ids from arrays as those of others; ValueError where they are not.
+
+    Renewed points take the place of some; their numbers are beyond the total of the bodies'.
+    """
     data = _part(arrays, "data/")
+    if PARENT in data:
+        like = with_faces(like)
+        ids = np.concatenate([ids[np.isin(ids, arrays["id"])], arrays["id"][arrays["id"] >= total]])
     points = MaterialPoints(**arrays, data=data)
     kinds = {**vars(like), **like.data}
     for name, rows in {**arrays, **data}.items():

@@ -22,6 +22,15 @@ ACROSS = "stretch across"
 """Name of what points of plane strain carry whose laws see a stretch across the plane, that of a mean dilatation."""
 
 
+def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the body (n,) of each point by its number; starts (bodies + 1,): first numbers of bodies, and of none.
+
+    Points beyond those as seeded are of one body after the other.
+    """
+    beyond = ids - starts[-1]
+    return np.where(beyond < 0, np.searchsorted(starts, ids, side="right") - 1, beyond % max(1, len(starts) - 1))
+
+
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return det F (n,) of (n, d, d); numpy's own, by factors, takes twenty times as long."""
     if F.shape[1] == 2:

@@ -62,6 +62,16 @@ class Probes:
         return over_all(comm, out)
 
 
+def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> None:
+    """Refuse, with a ValueError, probes whose domains have been renewed."""
+    found = np.zeros(len(probes.id))
+    found[points.find(probes.id)[0]] = 1.0
+    lost = np.flatnonzero(over_all(comm, found) == 0)
+    if len(lost):
+        what = f"probe at {probes.x0[lost[0]]}: its domain has been renewed in a run without it"
+        raise ValueError(f"{what}, must be given to all runs, or leave out Numerics(renewal=True)")
+
+
 def _same(a: Body, b: Body) -> bool:
     """Whether two bodies have the same points."""
     alike = len(a) == len(b) and a.dim == b.dim

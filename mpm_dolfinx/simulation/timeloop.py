@@ -29,7 +29,7 @@ from mpm_dolfinx.dynamics.energies import begun
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
-from mpm_dolfinx.probing.probes import Probes
+from mpm_dolfinx.probing.probes import Probes, check_there
 from mpm_dolfinx.simulation.events import Event, Events, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
@@ -150,6 +150,7 @@ def run(
     observers = [observe] if callable(observe) else observe
     if probes is not None:
         probes.check(simulation.scene.bodies, simulation.state.stage.present)
+        check_there(probes, simulation.state.points, comm)
     functions("observe", observers)
     for observer in observers:
         if _takes_nothing(observer):
@@ -159,6 +160,7 @@ def run(
         instance("after", after, Result)
     flag("energies", energies)
     simulation.state = _counting(simulation.scene, simulation.state, energies, after is not None)
+    simulation.state = replace(simulation.state, watched=None if probes is None else probes.id)
     now = simulation.state.t
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)

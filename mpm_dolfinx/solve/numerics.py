@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mpm_dolfinx.base.time_integration import substeps
+from mpm_dolfinx.base.validation import flag
 from mpm_dolfinx.solve.scheme import Scheme
 
 QUADRATURES = ("domain", "point")
@@ -28,6 +29,9 @@ class Numerics:
         Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
     method
         Of time integration: "sdirk2", of second order, or "backward-euler".
+    renewal
+        Whether domains of yielded soil that have become longer than a cell are renewed, see `stepping/renewal.py`:
+        of dry soil in plane strain, on equal cells, without inertia and groups, with `quadrature="domain"`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.
 
@@ -41,12 +45,14 @@ class Numerics:
     coupling: str = "schur-cg"
     tolerance: float = 1e-8
     method: str = "sdirk2"
+    renewal: bool = False
     petsc_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.quadrature not in QUADRATURES:
             raise ValueError(f"quadrature {self.quadrature!r}: must be {' or '.join(QUADRATURES)}")
         substeps(self.method, True)
+        flag("renewal", self.renewal)
         _ = self.scheme  # refuses what is none
 
     @property

@@ -30,7 +30,15 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, determinant, in_plane, in_space, with_ratio
+from mpm_dolfinx.points.material_points import (
+    ACROSS,
+    MaterialPoints,
+    body_of,
+    determinant,
+    in_plane,
+    in_space,
+    with_ratio,
+)
 from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay
@@ -337,7 +345,7 @@ class Motion:
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's body (n,)."""
-        return np.searchsorted(self._starts, points.id, side="right") - 1
+        return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""

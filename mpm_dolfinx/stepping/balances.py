@@ -38,7 +38,7 @@ class Acting(NamedTuple):
 class Start(NamedTuple):
     """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts.
 
-    yielded: whether soil has yielded before, on any process.
+    yielded: whether soil has yielded before, on any process; renewed: how many domains were renewed.
     """
 
     state: State
@@ -48,6 +48,7 @@ class Start(NamedTuple):
     dt: float
     yielded: bool
     acting: list[Acting]
+    renewed: int = 0
 
     def begun(self, acting: Acting, gone: Sequence[Any] | None) -> Acting:
         """Return what acts in a substep as it begins; gone: what loads returned of the last one."""

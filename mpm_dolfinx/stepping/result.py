@@ -35,6 +35,8 @@ class Result:
         Numbers so far: steps, iterations, steps cut for want of convergence, and refused for their error.
     rederived
         Domains that had folded, and were derived from F.
+    renewed, renewals
+        Domains of yielded soil that were replaced by new ones, and resets of the grid at which some were.
     balance, residual
         Worst relative errors so far of the fluid's balance, and of the two problems.
     wall, profile
@@ -56,6 +58,8 @@ class Result:
     cuts: int = 0
     rejected: int = 0
     rederived: int = 0
+    renewed: int = 0
+    renewals: int = 0
     balance: float = 0.0
     residual: float = 0.0
     wall: float = 0.0
@@ -176,6 +180,8 @@ class Result:
             newton=self.newton + report.newton,
             coupling=self.coupling + report.coupling,
             rederived=self.rederived + report.rederived,
+            renewed=self.renewed + report.renewed,
+            renewals=self.renewals + (report.renewed > 0),
             balance=max(self.balance, report.balance),
             residual=max(self.residual, *report.history[-1]),
         )

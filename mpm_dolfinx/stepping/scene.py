@@ -40,6 +40,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
@@ -136,6 +137,8 @@ class Scene:
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
+        self._renewed: Latest[tuple[MaterialPoints, int]] = Latest()
+        _ = self._renewal  # refuses scenes that have none
 
     @property
     def flows(self) -> bool:
@@ -222,6 +225,42 @@ class Scene:
                 return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
 
         return self._on_grid(points.arrays, make, grid.comm)
+
+    @cached_property
+    def _renewal(self) -> Renewal | None:
+        """Renews domains; None where these are never renewed."""
+        grid = self.grid
+        if not self.numerics.renewal:
+            return None
+        has = {
+            "is in 3D": grid.dim == 3,
+            "is axisymmetric": grid.axisymmetric,
+            "has cells of many sizes": not grid.even,
+            "has groups in contact": grid.copies > 1,
+            "has a fluid": self.fluid is not None,
+            "has inertia": self.momentum.inertia is not None,
+            "has quadrature 'point'": self.numerics.quadrature != "domain",
+            "has no soil that yields": not self.materials.evolves,
+        }
+        if found := [what for what, so in has.items() if so]:
+            what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
+            raise ValueError(f"{what}, must be of dry soil that yields, in plane strain on equal cells")
+        return Renewal(grid, self.bodies, self.materials)
+
+    def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
+        """Return a state for a reset of the grid, with points at their owners, and how many domains were renewed.
+
+        renew: whether any may be.
+        """
+        if self._renewal is None or state.stay is not None or not renew:
+            return state.at_owners(self.grid), 0
+
+        def make() -> tuple[MaterialPoints, int]:
+            with Timer("mpm: renew domains"):
+                return self._renewal.renewed(state.points, state.stage, state.watched)
+
+        points, count = self._renewed((*state.points.arrays, state.stage), make, self.grid.comm)
+        return (replace(state, points=points) if count else state).at_owners(self.grid), count
 
     def assembled(
         self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool

@@ -109,6 +109,11 @@ class Stage:
         """The faces of all conditions but tools and contacts."""
         return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
 
+    @property
+    def faces(self) -> list[Surface]:
+        """The faces of all conditions, on which tools press among them."""
+        return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
+
     def of(self, *kinds: type) -> dict[str, Any]:
         """Return the conditions of some classes by their names."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}

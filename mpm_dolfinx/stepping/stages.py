@@ -29,8 +29,9 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.tractions import owners
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
@@ -102,11 +103,15 @@ def begin_stage(
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
-    gone, pieces = _ids(scene.bodies, remove), state.pieces
+    own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
+    gone, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
+    if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
+        what = f"stage: add: body {add[0]}: domains of others have been renewed"
+        raise ValueError(f"{what}, must come before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
     others = before.data_names(before.named.keys() - begun.same(before))

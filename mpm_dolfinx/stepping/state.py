@@ -91,6 +91,8 @@ class State:
     rest : (unknowns,), m
         Displacement of the nodes of this process, ghosts included, for which given displacements and plates have the
         forces of an initial stress at rest; None once a stage changes these, and once the grid is reset.
+    watched : (m,)
+        Numbers of the points whose domains probes are in, which are not renewed.
     result, control
         Histories of the last run, and the memory of its step sizes; None before the first one.
     """
@@ -106,6 +108,7 @@ class State:
     velocity: NDArray[np.float64] | None = None
     held: NDArray[np.float64] | None = None
     rest: NDArray[np.float64] | None = None
+    watched: NDArray[np.int64] | None = None
     result: Result | None = None
     control: StepControl | None = None
 

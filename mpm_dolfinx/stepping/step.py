@@ -27,7 +27,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
     if dt > 0:
         scene.look_at([start, *gravity])
-    state = state if state.stays else state.at_owners(scene.grid)
+    state, renewed = (state, 0) if state.stays else scene.for_reset(state, dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
@@ -42,13 +42,13 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
-    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting)
+    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed)
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
     start = set_up(scene, state, dt, how)
-    report, kept = Report(), Kept()
+    report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
     state, gone = start.state, None
     on_grid, solvers = start.on_grid, start.matrices.solvers

@@ -1,0 +1,502 @@
+# SPDX-License-Identifier: MIT
+"""Cells that are filled anew with domains: which, with what, and what these get of the old ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.points.cutting import FACES, _slice, corner_bits, cut, simplex_volumes, vertices, volumes
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.polygons import NONE, Polygons
+from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
+
+APART = 0.01
+"""Cells by which ends of the surface of two domains may part, and be one.
+
+Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
+"""
+CRUMB = APART**2
+"""Share of a cell that is no domain of its own: what is left of one beside it has its mass.  Source: definition."""
+SMALL = (0.5 / EDGES) ** 2
+"""Share of a cell: where less is left of a domain, its cell is filled anew as well.
+
+Source: definition, half of an edge wide.
+"""
+COVERED = 0.25
+"""Share of a cell by which its pieces may miss what its surface says that it holds.  Source: definition, one domain."""
+SIDE = np.array([2, 1, 3, 0])
+"""Face of a domain that each edge of the ring is."""
+START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
+"""Corners at which each face starts and ends, anti-clockwise."""
+
+
+class Parts(NamedTuple):
+    """Parts of the surface in cells: rows (m,) of the faces, cell (m,), ends (m, 2, 2) in the cell, from 0 to 1.
+
+    t : (m, 2) places of the ends on the face, from 0 to 1; side : (m,) that of the cell on which it lies, else -1.
+    """
+
+    row: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    x: NDArray[np.float64]
+    t: NDArray[np.float64]
+    side: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class OuterFaces:
+    """Faces of domains (m,) that are on the surface: point, number of the face, its key, and as seeded its length, m,
+    and reference positions of its ends (m, 2, 2), m, the lower one first.
+    """
+
+    point: NDArray[np.int64]
+    face: NDArray[np.int64]
+    key: NDArray[np.int64]
+    area: NDArray[np.float64]
+    ends: NDArray[np.float64]
+
+
+class New(NamedTuple):
+    """New domains: corners (n, 4, 2), m; the group (n,) that shares what it gets; keys, lengths and ends of faces."""
+
+    corners: NDArray[np.float64]
+    group: NDArray[np.int64]
+    parent: NDArray[np.int64]
+    area: NDArray[np.float64]
+    ends: NDArray[np.float64]
+
+
+def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
+    """Return which domains (n, 4, 2) have an edge longer than so many cells, or are turned inside out in a part."""
+    ring = corners[:, RING] / grid.h
+    edge = np.roll(ring, -1, axis=1) - ring
+    parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
+    turned = parts.min(axis=0, initial=0.0) < -CRUMB * grid.cell_volume
+    return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | turned
+
+
+class RefilledCells:
+    """What is renewed in one reset.
+
+    Parameters
+    ----------
+    grid, points, body
+        Grid, points, and the body of each (n,).
+    flowed, needs
+        Which points (n,) may be renewed, and whose domains should.
+    faces, signs
+        The surface, and what acts on it, see `_signatures`.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        points: MaterialPoints,
+        body: NDArray[np.int64],
+        flowed: NDArray[np.bool_],
+        needs: NDArray[np.bool_],
+        faces: OuterFaces,
+        signs: tuple[NDArray, NDArray],
+    ):
+        self.grid = grid
+        self.points = points
+        self.body = body
+        self.pieces = cut(grid, points.corners)
+        self.cell = self.pieces.cell
+        self.cells = grid.cells
+        self.faces = faces
+        self.parts = self._parts(faces)
+        barred = self._barred(flowed, signs)
+        self.passed, self.region = self._chains(barred)
+        size = self.pieces.fraction * np.abs(volumes(points.corners))[self.pieces.point] / grid.cell_volume
+        filled = np.where(self.passed, self.region.area_of(self.cells), 1.0)
+        barred |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
+        self.chosen = self._chosen(flowed & needs, barred, size < SMALL)
+        """Which cells are filled anew."""
+        self.gone = self._at(self.chosen)
+        """Which points (n,) lose their domains, or parts of these."""
+
+    def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which points (n,) have a piece in some cells."""
+        out = np.zeros(len(self.points), dtype=bool)
+        out[self.pieces.point[cells[self.cell]]] = True
+        return out
+
+    def _barred(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
+        """Return the cells that hold other soil, several bodies, or faces on which not the same conditions act."""
+        of, cell = self.pieces.point, self.cell
+        parts = self.parts
+        low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
+        np.minimum.at(low, cell, self.body[of])
+        np.maximum.at(high, cell, self.body[of])
+        barred = low != high
+        barred[cell[~flowed[of]]] = True
+        sign = signs[1][np.searchsorted(signs[0], self.faces.key[parts.row])]
+        barred[parts.cell[sign == NONE]] = True
+        place = 5 * parts.cell + parts.side + 1  # within, and on each side
+        least, most = np.full(5 * self.cells, np.iinfo(np.int64).max), np.full(5 * self.cells, -1)
+        np.minimum.at(least, place, sign)
+        np.maximum.at(most, place, sign)
+        barred[np.flatnonzero((most > least) & (most >= 0)) // 5] = True
+        return barred
+
+    def _chosen(
+        self, needed: NDArray[np.bool_], barred: NDArray[np.bool_], small: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return the cells to fill anew: of points (n,) that need it, and where little of others would be left."""
+        of, cell = self.pieces.point, self.cell
+        chosen = np.zeros(self.cells, dtype=bool)
+        chosen[cell[needed[of]]] = True
+        chosen &= ~barred
+        more = chosen
+        while more.any():
+            more = np.zeros(self.cells, dtype=bool)
+            more[cell[self._at(chosen)[of] & small & ~(barred | chosen)[cell]]] = True
+            chosen |= more
+        return chosen
+
+    def _parts(self, faces: OuterFaces) -> Parts:
+        """Return the parts of the surface in cells."""
+        grid = self.grid
+        corners = self.points.corners[faces.point]
+        n = np.arange(len(faces.face))
+        ends = np.stack([corners[n, START[faces.face]], corners[n, END[faces.face]]])
+        y = (ends - grid.low) / grid.h
+        nearest = np.rint(y)
+        y = np.where(np.abs(y - nearest) < grid.snap, nearest, y)
+        t = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, len(n), 1))
+        s, row = np.concatenate([y, t], axis=2).transpose(0, 2, 1), n
+        for axis in range(2):
+            s, row = _slice(s, row, axis)
+        s = np.where((s[0, 2] <= s[1, 2])[None, None], s, s[::-1])
+        way = s[1, :2] - s[0, :2]
+        size = np.hypot(*way)
+        some = size > NEAR
+        s, way = s[:, :, some], way[:, some]
+        row, size = row[some], size[some]
+        outward = np.stack([way[1], -way[0]]) / size
+        middle = s[:, :2].mean(axis=0)
+        flat = np.abs(way) < grid.snap[:, None]
+        on = flat & (np.abs(middle - np.rint(middle)) < grid.snap[:, None])
+        index = np.floor(np.where(on, np.rint(middle) - (outward > 0), middle)).astype(np.int64)
+        index = np.clip(index, 0, (grid.shape - 1)[:, None])
+        side = np.where(on[0], np.where(outward[0] > 0, 1, 0), np.where(on[1], np.where(outward[1] > 0, 3, 2), NONE))
+        return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
+
+    def _chains(self, barred: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
+        """Return the cells that the surface passes through, and what it leaves of those where it does so once.
+
+        The others of them are barred.
+        """
+        inner = self.parts.side == NONE
+        cell, x = self.parts.cell[inner], self.parts.x[inner]
+        passed = np.zeros(self.cells, dtype=bool)
+        passed[cell] = True
+        on = (np.minimum(x, 1 - x) < NEAR).any(axis=2)
+        starts, ends = (np.flatnonzero(on[:, k]) for k in (0, 1))
+        once = passed.copy()
+        way = np.stack([sum_by(cell, column, self.cells) for column in (x[:, 1] - x[:, 0]).T], axis=1)
+        P, Q = np.zeros((self.cells, 2)), np.zeros((self.cells, 2))
+        for at, k, place in ((starts, 0, P), (ends, 1, Q)):
+            once &= np.bincount(cell[at], minlength=self.cells) == 1
+            place[cell[at]] = x[at, k]
+        once &= np.abs(Q - P - way).max(axis=1) < APART
+        once &= np.linalg.norm(Q - P, axis=1) > APART
+        a, b = x[:, 0] - P[cell], x[:, 1] - P[cell]
+        bulge = sum_by(cell, (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, self.cells)
+        along = np.einsum("mi,mi->m", a + b, (Q - P)[cell])
+        order = np.lexsort((along, cell))
+        order = order[once[cell[order]]]
+        cell, x = cell[order], x[order]
+        apart = (np.abs(x[1:, 0] - x[:-1, 1]).max(axis=1) > APART) & (cell[1:] == cell[:-1])
+        once[cell[1:][apart]] = False
+        barred |= passed & ~once
+        kept = once[cell]
+        cell, x = cell[kept], x[kept]
+        at = np.flatnonzero(once)
+        surface = resampled(np.searchsorted(at, cell), x, P[at], Q[at], bulge[at])
+        region = Region(at, surface)
+        barred[at[~region.sound]] = True
+        return passed, region
+
+    # ---- new domains ----------------------------------------------------------------------------
+
+    def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the number of each renewed cell among these."""
+        number = np.cumsum(self.chosen) - 1
+        return number[cells]
+
+    def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the places (n, k, 2), m, of places y (n, k, 2) in cells (n,), from 0 to 1."""
+        index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
+        return self.grid.low + self.grid.h * (index[:, None] + y)
+
+    def full(self) -> New:
+        """Return the new domains of full cells."""
+        cells = np.flatnonzero(self.chosen & ~self.passed)
+        bits = corner_bits(2)
+        y = (bits[:, None] + bits[None]) / 2  # (4 domains, 4 corners, 2)
+        of = np.repeat(cells, 4)
+        local = np.tile(y, (len(cells), 1, 1))
+        return self._beside(of, local, *_no_faces(len(of)))
+
+    def partial(self) -> list[New]:
+        """Return the new domains of cells that the surface passes through."""
+        out = []
+        inner = np.flatnonzero(self.parts.side == NONE)
+        parts = Parts(*(column[inner] for column in self.parts))
+        order = np.argsort(parts.cell, kind="stable")
+        whole = sum_by(parts.cell, self.faces.area[parts.row] * np.ptp(parts.t, axis=1), self.cells)
+        for rows, local, surface in self.region.quadrilaterals(self.chosen):
+            cells = self.region.cells[rows]
+            parent, area, ends = _no_faces(len(cells))
+            at, face = np.nonzero(surface)
+            lower, upper = (local[at, FACES[2][face, k]] for k in (0, 1))
+            key, X = self._nearest(parts, order, cells[at], lower, upper)
+            parent[at, face], ends[at, face] = key, X
+            edge = np.linalg.norm(upper - lower, axis=1)
+            total = sum_by(cells[at], edge, self.cells)  # of both edges that it becomes
+            area[at, face] = edge / total[cells[at]] * whole[cells[at]]
+            out.append(self._beside(cells, local, parent, area, ends))
+        return out
+
+    def _nearest(
+        self,
+        parts: Parts,
+        order: NDArray[np.int64],
+        cells: NDArray[np.int64],
+        lower: NDArray[np.float64],
+        upper: NDArray[np.float64],
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return of edges in cells (m,) the key (m,) of the part of the surface nearest to their middles, and the
+        reference positions (m, 2, 2), m, of their ends, by the parts nearest to these.
+        """
+        first = np.searchsorted(parts.cell[order], cells, side="left")
+        stop = np.searchsorted(parts.cell[order], cells, side="right")
+        edge = np.repeat(np.arange(len(cells)), stop - first)
+        part = order[
+            np.arange(len(edge)) - np.repeat(np.cumsum(stop - first) - (stop - first), stop - first) + first[edge]
+        ]
+        a, way = parts.x[part, 0], parts.x[part, 1] - parts.x[part, 0]
+        found = []
+        for place in ((lower + upper) / 2, lower, upper):
+            share = np.einsum("ri,ri->r", place[edge] - a, way) / np.maximum((way**2).sum(axis=1), TINY)
+            share = np.clip(share, 0.0, 1.0)
+            far = np.linalg.norm(a + share[:, None] * way - place[edge], axis=1)
+            best = np.lexsort((far, edge))
+            best = best[np.searchsorted(edge[best], np.arange(len(cells)))]
+            t0, t1 = parts.t[part[best]].T
+            found.append((parts.row[part[best]], t0 + share[best] * (t1 - t0)))
+        key = self.faces.key[found[0][0]]
+        return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
+
+    def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2), m, of places t (m,) on faces, from 0 at their start to 1."""
+        face = self.faces.face[row]
+        turned = START[face] != FACES[2][face, 0]
+        share = np.where(turned, 1 - t, t)[:, None]
+        low, high = self.faces.ends[row].transpose(1, 0, 2)
+        return low + share * (high - low)
+
+    def _beside(
+        self,
+        cells: NDArray[np.int64],
+        local: NDArray[np.float64],
+        parent: NDArray[np.int64],
+        area: NDArray[np.float64],
+        ends: NDArray[np.float64],
+    ) -> New:
+        """Return new domains of cells (n,), with faces where sides of their cells are the surface."""
+        parts = self.parts
+        on = np.flatnonzero(parts.side != NONE)
+        place = 4 * parts.cell[on] + parts.side[on]
+        order = np.argsort(place, kind="stable")
+        bordered = Parts(parts.row[on], place, parts.x[on], parts.t[on], parts.side[on])
+        length = np.linalg.norm(bordered.x[:, 1] - bordered.x[:, 0], axis=1)
+        seeded = self.faces.area[bordered.row] * np.ptp(bordered.t, axis=1)
+        known = np.unique(place)
+        for side in range(4):
+            axis, end = divmod(side, 2)
+            for face in range(4):
+                a, b = (local[:, k] for k in FACES[2][face])
+                flat = (np.abs(a[:, axis] - end) < NEAR) & (np.abs(b[:, axis] - end) < NEAR)
+                flat &= np.linalg.norm(b - a, axis=1) > NEAR
+                at = np.flatnonzero(flat & np.isin(4 * cells + side, known))
+                if not len(at):
+                    continue
+                here = 4 * cells[at] + side
+                key, X = self._nearest(bordered, order, here, a[at], b[at])
+                # the parts may end within the side
+                middle = (a[at, 1 - axis] + b[at, 1 - axis]) / 2
+                low, high = np.full(4 * self.cells, np.inf), np.full(4 * self.cells, -np.inf)
+                np.minimum.at(low, place, bordered.x[:, :, 1 - axis].min(axis=1))
+                np.maximum.at(high, place, bordered.x[:, :, 1 - axis].max(axis=1))
+                covered = (middle > low[here]) & (middle < high[here])
+                dense = sum_by(place, seeded, 4 * self.cells) / np.maximum(sum_by(place, length, 4 * self.cells), TINY)
+                at, here = at[covered], here[covered]
+                key, X = key[covered], X[covered]
+                parent[at, face], ends[at, face] = key, X
+                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[here]
+        return New(self._place(cells, local), self._group(cells), parent, area, ends)
+
+    @property
+    def rest(self) -> New:
+        """What domains that are gone leave beyond the renewed cells."""
+        return self._rest[0]
+
+    @property
+    def left(self) -> NDArray[np.int64]:
+        """Pieces of domains that are gone, beyond the renewed cells."""
+        return self._rest[1]
+
+    @cached_property
+    def _rest(self) -> tuple[New, NDArray[np.int64]]:
+        """What domains that are gone leave beyond the renewed cells, each piece a group; and these pieces."""
+        pieces, points = self.pieces, self.points
+        left = np.flatnonzero(self.gone[pieces.point] & ~self.chosen[self.cell])
+        area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
+        left = left[area > CRUMB * self.grid.cell_volume]
+        rings, of = _convex(points.corners[pieces.point[left]])
+        rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
+        halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
+        polygons = rings.within(self._place(self.cell[left][of], halves)).simplified(NEAR * self.grid.h.min())
+        row, quads, edge = polygons.quadrilaterals()
+        piece = left[of[row]]
+        sound = Polygons.rings(quads).area > CRUMB**2 * self.grid.cell_volume
+        piece, quads = piece[sound], quads[sound]
+        edge = edge[sound]
+        left, number = np.unique(piece, return_inverse=True)
+        corners = np.empty_like(quads)
+        corners[:, RING] = quads
+        parent, area, ends = _no_faces(len(quads))
+        faces = self.faces
+        index = np.full((len(points), 4), NONE)
+        index[faces.point, faces.face] = np.arange(len(faces.face))
+        for k in range(4):
+            at = np.flatnonzero(edge[:, k] != NONE)
+            row = index[pieces.point[piece[at]], edge[at, k]]
+            at, row = at[row != NONE], row[row != NONE]
+            face = SIDE[k]
+            old = points.corners[faces.point[row]]
+            low, high = (old[np.arange(len(row)), FACES[2][faces.face[row], e]] for e in (0, 1))
+            way = high - low
+            t = [
+                np.einsum("ri,ri->r", corners[at, c] - low, way) / np.maximum((way**2).sum(axis=1), TINY)
+                for c in FACES[2][face]
+            ]
+            parent[at, face] = faces.key[row]
+            area[at, face] = faces.area[row] * np.abs(t[1] - t[0])
+            X0, X1 = faces.ends[row].transpose(1, 0, 2)
+            ends[at, face] = np.stack([X0 + s[:, None] * (X1 - X0) for s in t], axis=1)
+        return New(corners, int(self.chosen.sum()) + number.ravel(), parent, area, ends), left
+
+    # ---- what they get --------------------------------------------------------------------------
+
+    def rise(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the slopes (n, 2, k) of values (points, k) in the cells of new domains, fitted to what lies there."""
+        pieces, h = self.pieces, self.grid.h
+        weight = pieces.fraction * self.points.volume0[pieces.point]
+        whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
+
+        def means(columns: NDArray) -> NDArray:
+            return np.stack([sum_by(self.cell, weight * c, self.cells) / whole for c in columns.T], axis=1)
+
+        y, q = self.points.x[pieces.point] / h, values[pieces.point]
+        y = y - means(y)[self.cell]
+        q = q - means(q)[self.cell]
+        normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
+        right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
+        value, axes = np.linalg.eigh(normal)
+        some = value > SAME  # cells squared: along a row of places nothing is known across it
+        back = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
+        slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / h[:, None]
+        return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.left]])[group]]
+
+    def pairs(
+        self, corners: NDArray[np.float64], group: NDArray[np.int64]
+    ) -> tuple[NDArray, NDArray, NDArray, tuple[NDArray, NDArray, NDArray]]:
+        """Return pairs of old and new domains: both, and the share of the old one's mass in the new one.
+
+        Last, of pieces of old domains: the domain, the group that they go to, and their share of it.
+        """
+        pieces = self.pieces
+        into = np.flatnonzero(self.chosen[self.cell] & self.gone[pieces.point])
+        piece = np.concatenate([into, self.left])
+        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.left))])
+        share = pieces.fraction[piece]
+        whole = sum_by(pieces.point[piece], share, len(self.points))
+        share = share / whole[pieces.point[piece]]  # of slivers that are dropped
+        order = np.argsort(group, kind="stable")
+        first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
+        count = stop - first
+        of = np.repeat(np.arange(len(piece)), count)
+        at = order[np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + first[of]]
+        old = pieces.point[piece[of]]
+        common = np.zeros(len(of))
+        rings, which = _convex(self.points.corners[old])
+        common += np.maximum(sum_by(which, rings.within(corners[at][which][:, RING]).area, len(of)), 0.0)
+        common += EPSILON * np.abs(volumes(corners[at]))  # what no piece lies on gets the mean of its cell
+        total = sum_by(of, common, len(piece))
+        gone = pieces.point[piece]
+        return old, at, share[of] * common / total[of], (gone, groups, share)
+
+    def on_faces(
+        self,
+        values: NDArray[np.float64],
+        corners: NDArray[np.float64],
+        parent: NDArray[np.int64],
+        group: NDArray[np.int64],
+        points: MaterialPoints,
+    ) -> NDArray[np.float64]:
+        """Return what new domains (n, ...) keep on their faces: means of what the surface in their cell had."""
+        parts = self.parts
+        inside = np.flatnonzero(self.chosen[parts.cell])
+        cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
+        length = np.linalg.norm((parts.x[inside, 1] - parts.x[inside, 0]) * self.grid.h, axis=1)
+        flat = values[of].reshape(len(of), int(np.prod(values.shape[1:])))
+        count = int(self.chosen.sum())
+        number = self._group(cell)
+        whole = np.maximum(sum_by(number, length, count), TINY)
+        means = np.stack([sum_by(number, length * column, count) / whole for column in flat.T], axis=1)
+        pieces = values[self.pieces.point[self.left]].reshape(len(self.left), flat.shape[1])
+        out = np.concatenate([means, pieces])[group] * (parent != NONE).any(axis=1)[:, None]
+        return out.reshape(len(corners), *values.shape[1:])
+
+
+def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return keys, lengths and ends of faces of n domains that have none on the surface."""
+    return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
+
+
+def _convex(corners: NDArray[np.float64]) -> tuple[Polygons, NDArray[np.int64]]:
+    """Return domains (n, 4, 2) as convex polygons, whose edges have the numbers of faces, and the domain of each."""
+    ring = corners[:, RING]
+    edge = np.tile(SIDE, (len(ring), 1))
+    away = np.roll(ring, -1, axis=1) - ring
+    before = np.roll(away, 1, axis=1)
+    turn = before[:, :, 0] * away[:, :, 1] - before[:, :, 1] * away[:, :, 0]
+    bent = turn.min(axis=1) < 0
+    even = np.flatnonzero(~bent)
+    out, of = [(ring[even], edge[even])], [even]
+    at = np.flatnonzero(bent)
+    if len(at):
+        halves = [[(0, 1, 2, 2), (0, 2, 3, 3)], [(1, 2, 3, 3), (1, 3, 0, 0)]]
+        kept = [[(0, 1, NONE, NONE), (NONE, 2, NONE, 3)], [(1, 2, NONE, NONE), (NONE, 3, NONE, 0)]]
+        areas = np.array([[Polygons.rings(ring[at][:, list(half)]).area for half in two] for two in halves])
+        best = areas.min(axis=1).argmax(axis=0)
+        for way in (0, 1):
+            for half, numbers in zip(halves[way], kept[way], strict=True):
+                rows = at[best == way]
+                rows = rows[Polygons.rings(ring[rows][:, list(half)]).area > 0]
+                number = np.array([SIDE[k] if k != NONE else NONE for k in numbers])
+                out.append((ring[rows][:, list(half)], np.tile(number, (len(rows), 1))))
+                of.append(rows)
+    x, edge = (np.concatenate(column) for column in zip(*out, strict=True))
+    return Polygons.rings(x, edge), np.concatenate(of)

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""Faces of renewed domains: which faces of bodies as seeded they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+PARENT = "renewed faces"
+AREA = "renewed areas"
+ENDS = "renewed ends"
+"""Names of what points carry for each face: the key of the face as seeded on which it lies, -1 for none; its area as
+seeded, m; the reference positions of its ends, m."""
+
+
+def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return numbers (m,) of faces of domains in the plane, of points as seeded and by their numbers there."""
+    return 4 * np.asarray(point, dtype=np.int64) + face
+
+
+def with_faces(points: MaterialPoints) -> MaterialPoints:
+    """Return the points with what renewed faces have, none where they have nothing of it."""
+    if PARENT in points.data:
+        return points
+    n = len(points)
+    none = {PARENT: np.full((n, 4), -1), AREA: np.zeros((n, 4)), ENDS: np.zeros((n, 4, 2, 2))}
+    return replace(points, data={**points.data, **none})
+
+
+@dataclass(frozen=True)
+class RenewedFaces:
+    """Faces of renewed domains on surfaces (m,).
+
+    row : row among the faces of all these surfaces as seeded, on which it lies; at, face : index of the point, and
+    number of the face there; xi : (m, 2, 2) corners of the part of the face that counts; area, m, and ends (m, 2, 2),
+    m: see `AREA` and `ENDS`; old : which of places (n,) lie on faces as seeded, where this is of places.
+    """
+
+    row: NDArray[np.int64]
+    at: NDArray[np.int64]
+    face: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    area: NDArray[np.float64]
+    ends: NDArray[np.float64]
+    old: NDArray[np.bool_] | None = None
+
+    def of(self, number: NDArray[np.int64]) -> RenewedFaces:
+        """Return the face of each place (n,), by its number among these; negative where it is on a face as seeded."""
+        old, at = number < 0, np.maximum(number, 0)
+        if not len(self.row):
+            return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
+        return RenewedFaces(*(v[at] for v in self._columns), old)
+
+    @property
+    def _columns(self) -> tuple[NDArray, ...]:
+        return self.row, self.at, self.face, self.xi, self.area, self.ends
+
+    def in_place_of(
+        self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return areas of parts and of whole faces, m, and their numbers, in place of those (n,) of faces as seeded."""
+        part = np.ptp(self.xi, axis=1).max(axis=1) / 2
+        new = self.area * part, self.area, self.face
+        return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
+
+    def reference(self, X: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the reference positions (n, 2), m, of places xi (n, 2), for those X of faces as seeded."""
+        along = xi[np.arange(len(xi)), 1 - self.face // 2]
+        share = (1 + along[:, None]) / 2
+        new = self.ends[:, 0] + share * (self.ends[:, 1] - self.ends[:, 0])
+        return np.where(self.old[:, None], X, new)
+
+
+def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> RenewedFaces:
+    """Return the faces of renewed domains that lie on surfaces, one after the other."""
+    at, face = np.nonzero(points.data[PARENT] >= 0)
+    key = points.data[PARENT][at, face]
+    area, ends = points.data[AREA][at, face], points.data[ENDS][at, face]
+    found, start = [], 0
+    for faces in several:
+        own = keys(faces.id, faces.face)
+        order = np.argsort(own, kind="stable")
+        near = (
+            order[np.minimum(np.searchsorted(own[order], key), len(own) - 1)] if len(own) else np.zeros(len(key), int)
+        )
+        rows = np.flatnonzero(own[near] == key) if len(own) else np.zeros(0, dtype=np.int64)
+        low, high = _within(ends[rows], faces.region)
+        rows, low, high = (v[high > low] for v in (rows, low, high))
+        xi = np.empty((len(rows), 2, 2))
+        axis = face[rows] // 2
+        n = np.arange(len(rows))
+        for k, t in enumerate((low, high)):
+            xi[n, k, axis] = 2.0 * (face[rows] % 2) - 1
+            xi[n, k, 1 - axis] = 2 * t - 1
+        found.append((start + near[rows], at[rows], face[rows], xi, area[rows], ends[rows]))
+        start += len(faces)
+    return RenewedFaces(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return from where to where (m,), from 0 to 1, edges with these ends (m, 2, 2), m, lie in a region (2, 2), m."""
+    low, high = np.zeros(len(ends)), np.ones(len(ends))
+    way = ends[:, 1] - ends[:, 0]
+    slack = SAME * np.abs(way).max(axis=1)
+    for axis in range(2):
+        for end, sign in ((0, 1.0), (1, -1.0)):
+            beyond = sign * (ends[:, 0, axis] - region[end, axis])
+            slope = sign * way[:, axis]
+            flat = np.abs(slope) <= slack
+            t = -beyond / np.where(flat, 1.0, slope)
+            low = np.where(~flat & (slope > 0), np.maximum(low, t), low)
+            high = np.where(~flat & (slope < 0), np.minimum(high, t), high)
+            high = np.where(flat & (beyond < -slack), low, high)
+    return low, high

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""Convex polygons in the plane, many at a time: cut by lines, and divided into quadrilaterals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+NONE = -1
+"""Number of an edge that has none."""
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """Polygons (n,) of up to k vertices, anti-clockwise.
+
+    x : (n, k, 2), m, vertices, the last one repeated; count : (n,) how many they are; edge : (n, k) number of the edge
+    from each vertex to the next, by which it is known after cuts.
+    """
+
+    x: NDArray[np.float64]
+    count: NDArray[np.int64]
+    edge: NDArray[np.int64]
+
+    @classmethod
+    def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:
+        """Return polygons that all have k vertices x (n, k, 2); without numbers (n, k) edges have none."""
+        n, k = x.shape[:2]
+        return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
+
+    def of(self, rows: NDArray) -> Polygons:
+        """Return some of the polygons."""
+        return Polygons(self.x[rows], self.count[rows], self.edge[rows])
+
+    @property
+    def area(self) -> NDArray[np.float64]:
+        """Areas (n,), m^2."""
+        return self._moments[0]
+
+    @property
+    def centroid(self) -> NDArray[np.float64]:
+        """Centroids (n, 2), m, of polygons of some area; of others a vertex."""
+        area, moment = self._moments
+        some = area > 0
+        return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])
+
+    @property
+    def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Areas, and first moments about the first vertices."""
+        y = self.x - self.x[:, :1]
+        after = np.roll(y, -1, axis=1)
+        twice = y[:, :, 0] * after[:, :, 1] - y[:, :, 1] * after[:, :, 0]
+        return twice.sum(axis=1) / 2, np.einsum("nk,nki->ni", twice, y + after) / 6
+
+    def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
+        """Return what of each polygon has normal . x <= level; normal (n, 2), level (n,).
+
+        By Sutherland and Hodgman (1974).  A new edge has no number.
+        """
+        n, k = self.edge.shape
+        here = np.arange(k) < self.count[:, None]
+        beyond = np.where(here, np.einsum("nki,ni->nk", self.x, normal) - level[:, None], 0.0)
+        last = np.arange(k) == self.count[:, None] - 1
+        x1 = np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
+        beyond1 = np.where(last, beyond[:, :1], np.roll(beyond, -1, axis=1))
+        inside = beyond <= 0
+        crosses = here & (inside != (beyond1 <= 0))
+        share = np.divide(beyond, beyond - beyond1, out=np.zeros_like(beyond), where=crosses)
+        met = self.x + share[:, :, None] * (x1 - self.x)
+        x = np.stack([self.x, met], axis=2).reshape(n, 2 * k, 2)
+        edge = np.stack([self.edge, np.where(inside, NONE, self.edge)], axis=2).reshape(n, 2 * k)
+        kept = np.stack([here & inside, crosses], axis=2).reshape(n, 2 * k)
+        return _packed(x, edge, kept)
+
+    def within(self, others: NDArray[np.float64]) -> Polygons:
+        """Return what of each polygon lies in another one, convex and anti-clockwise, with vertices (n, m, 2)."""
+        out = self
+        for k in range(others.shape[1]):
+            way = others[:, (k + 1) % others.shape[1]] - others[:, k]
+            normal = np.stack([way[:, 1], -way[:, 0]], axis=1)
+            out = out.cut(normal, np.einsum("ni,ni->n", normal, others[:, k]))
+        return out
+
+    def simplified(self, near: float) -> Polygons:
+        """Return the polygons without vertices that lie as near, m, to the one before."""
+        k = self.edge.shape[1]
+        here = np.arange(k) < self.count[:, None]
+        last = np.arange(k) == self.count[:, None] - 1
+        x1 = np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
+        return _packed(self.x, self.edge, here & (np.abs(x1 - self.x).max(axis=2) > near))
+
+    def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+        """Return a fan of quadrilaterals about the first vertices.
+
+        Returns
+        -------
+        The polygon (m,) each is of; its vertices (m, 4, 2), of a triangle the last one twice; numbers (m, 4) of its
+        edges.
+        """
+        found = []
+        for k in range(0, max(0, int(self.count.max(initial=0)) - 2), 2):
+            rows = np.flatnonzero(self.count > k + 2)
+            at = [np.zeros(len(rows), dtype=np.int64), np.full(len(rows), k + 1), np.full(len(rows), k + 2)]
+            at.append(np.minimum(k + 3, self.count[rows] - 1))
+            x = np.stack([self.x[rows, i] for i in at], axis=1)
+            edge = np.stack([self.edge[rows, i] for i in at], axis=1)
+            edge[:, 0] = edge[:, 0] if k == 0 else NONE
+            edge[at[3] == at[2], 2] = NONE
+            edge[at[3] < self.count[rows] - 1, 3] = NONE
+            found.append((rows, x, edge))
+        if not found:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4), dtype=np.int64)
+        rows, x, edge = (np.concatenate(column) for column in zip(*found, strict=True))
+        return rows, x, edge
+
+
+def _packed(x: NDArray[np.float64], edge: NDArray[np.int64], kept: NDArray[np.bool_]) -> Polygons:
+    """Return polygons of those vertices (n, k) that are kept."""
+    count = kept.sum(axis=1)
+    most = max(1, int(count.max(initial=0)))
+    order = np.argsort(~kept, axis=1, kind="stable")[:, :most]
+    order = np.take_along_axis(order, np.minimum(np.arange(most), np.maximum(count - 1, 0)[:, None]), axis=1)
+    out = np.take_along_axis(edge, order, axis=1)
+    out[np.arange(most) >= np.maximum(count, 1)[:, None]] = NONE
+    return Polygons(np.take_along_axis(x, order[:, :, None], axis=1), count, out)

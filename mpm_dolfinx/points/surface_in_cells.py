@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""The surface of bodies in the plane in single cells, and quadrilaterals that fill what lies behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.tolerances import NEAR, TINY
+from mpm_dolfinx.points.polygons import NONE, Polygons
+
+EDGES = 4
+"""Edges that the surface of a body has in a cell that is filled anew.
+
+Plateau (flow): halved 1.6e-03, doubled 1.5e-03, cells 9.0e-02.
+"""
+BENT = 1 - 3**0.5 / 2
+"""Cells by which the surface turns at a corner; what bends less is divided evenly.
+
+Source: exact, a chord of one cell in a circle of a cell's radius: the grid sees no smaller one.
+"""
+RING = np.array([0, 1, 3, 2])
+"""Corners of a domain, anti-clockwise."""
+BOX = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+"""Corners of a cell (1, 4, 2), anti-clockwise."""
+_HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]]) / 2
+
+
+class Region:
+    """What the bodies fill of cells (n,) that the surface passes through once, in coordinates from 0 to 1.
+
+    Parameters
+    ----------
+    cells
+        The cells.
+    surface : (n, EDGES + 1, 2)
+        Vertices of the surface in them, from where it enters to where it leaves, with the body on its left.
+    """
+
+    def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):
+        self.cells = cells
+        edges = surface.shape[1] - 1
+        most = edges + 10  # with those of halves of its sides, and one more
+        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in halves of a side
+        end = np.where(end <= start + NEAR, end + 8, end)
+        first = np.floor(start + NEAR).astype(np.int64) + 1
+        count = np.maximum(0, np.ceil(end - NEAR).astype(np.int64) - first)
+        x = np.zeros((len(cells), most, 2))
+        x[:, : edges + 1] = surface
+        for k in range(8):
+            has = count > k
+            x[has, edges + 1 + k] = _HALVES[(first[has] + k) % 8]
+        size = edges + 1 + count
+        odd = np.flatnonzero(size % 2)
+        after = np.where((np.arange(most) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x[:, :1])
+        after = np.where((np.arange(most) < size[:, None])[:, :, None], after, x)
+        length = np.linalg.norm(after - x, axis=2)[odd]
+        length[:, :edges] = 0.0  # not of the surface
+        at = length.argmax(axis=1)
+        place = np.arange(most)[None]
+        middle = (x[odd, at] + after[odd, at]) / 2
+        grown = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)
+        grown[np.arange(len(odd)), at + 1] = middle
+        x[odd] = grown
+        self._size = size + size % 2
+        last = np.take_along_axis(x, (self._size - 1)[:, None, None], axis=1)
+        x = np.where((np.arange(most) < self._size[:, None])[:, :, None], x, last)
+        self._x = x
+        ring = Polygons(x, self._size, np.full(x.shape[:2], NONE))
+        self.area = ring.area
+        self._middle = ring.centroid
+        after = np.where((np.arange(most) == self._size[:, None] - 1)[:, :, None], x[:, :1], np.roll(x, -1, axis=1))
+        a, b = x - self._middle[:, None], after - self._middle[:, None]
+        sees = a[:, :, 0] * b[:, :, 1] - a[:, :, 1] * b[:, :, 0]
+        sees = np.where(np.arange(most) < self._size[:, None], sees, 1.0)
+        self.sound = (sees.min(axis=1) > 0) & (self.area > NEAR)
+
+    def area_of(self, count: int) -> NDArray[np.float64]:
+        """Return the areas of so many cells, from 0 to 1; of those without a region 1."""
+        out = np.ones(count)
+        out[self.cells] = self.area
+        return out
+
+    def quadrilaterals(
+        self, chosen: NDArray[np.bool_]
+    ) -> list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]]:
+        """Return rows (m,) of this, corners (m, 4, 2) of the domains there, and which faces (m, 4) are the surface."""
+        out = []
+        rows = np.flatnonzero(chosen[self.cells])
+        corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
+        surface = [np.zeros((0, 4), dtype=bool)]
+        for k in range(0, self._x.shape[1], 2):
+            at = rows[self._size[rows] > k]
+            size = self._size[at]
+            two = np.stack([self._x[at, k], self._x[at, k + 1], self._x[at, (k + 2) % size]], axis=1)
+            ring = np.concatenate([self._middle[at, None], two], axis=1)
+            domain = np.empty_like(ring)
+            domain[:, RING] = ring
+            on = np.zeros((len(at), 4), dtype=bool)
+            on[:, 1] = k < EDGES
+            on[:, 3] = k + 1 < EDGES
+            corners.append(domain)
+            of.append(at)
+            surface.append(on)
+        out.append((np.concatenate(of), np.concatenate(corners), np.concatenate(surface)))
+        return out
+
+
+def resampled(
+    of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64], bulge: NDArray
+) -> NDArray[np.float64]:
+    """Return vertices (n, EDGES + 1, 2) of surfaces from P to Q (n, 2), evenly along their parts.
+
+    Their area beyond the chords, bulge (n,), stays what it is: vertices are shifted by what they would lose.
+
+    of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
+    """
+    length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+    gone = np.concatenate([[0.0], np.cumsum(length)])
+    first, stop = (np.searchsorted(of, np.arange(len(P)), side=side) for side in ("left", "right"))
+    ends = gone[first], gone[stop]
+    out = np.concatenate([P[:, None], np.zeros((len(P), EDGES - 1, 2)), Q[:, None]], axis=1)
+    at = np.zeros((len(P), EDGES + 1))
+    at[:, 0], at[:, -1] = ends
+
+    def divide(low: int, high: int) -> None:
+        """Put a vertex between two: at the sharpest corner, or in the middle of what is nearly straight."""
+        middle = (low + high) // 2
+        a, chord = out[:, low], out[:, high] - out[:, low]
+        off = x[:, 0] - a[of]
+        far = np.abs(chord[of, 0] * off[:, 1] - chord[of, 1] * off[:, 0])
+        far /= np.maximum(np.linalg.norm(chord, axis=1), TINY)[of]
+        within = (gone[:-1] > at[of, low]) & (gone[:-1] < at[of, high])
+        far = np.where(within, far, 0.0)
+        order = np.lexsort((far, of))
+        corner = order[stop - 1]
+        aim = (at[:, low] + at[:, high]) / 2
+        aim = np.where(far[corner] > BENT, gone[corner], aim)
+        part = np.clip(np.searchsorted(gone, aim, side="right") - 1, first, stop - 1)
+        t = (aim - gone[part]) / np.maximum(length[part], TINY)
+        at[:, middle] = aim
+        out[:, middle] = x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
+
+    step = EDGES
+    while step > 1:
+        for low in range(0, EDGES, step):
+            divide(low, low + step)
+        step //= 2
+    y = out - P[:, None]
+    has = (y[:, :-1, 0] * y[:, 1:, 1] - y[:, :-1, 1] * y[:, 1:, 0]).sum(axis=1) / 2
+    way = out[:, 2:] - out[:, :-2]
+    normal = np.stack([way[:, :, 1], -way[:, :, 0]], axis=2)
+    size = np.maximum(np.linalg.norm(way, axis=2), TINY)
+    shift = 2 * (bulge - has) / size.sum(axis=1)
+    out[:, 1:-1] += shift[:, None, None] * normal / size[:, :, None]
+    return np.clip(out, 0.0, 1.0)
+
+
+def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where places (n, 2) on the border of the unit square lie, anti-clockwise, from 0 to 4."""
+    near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
+    side = near.argmin(axis=1)
+    along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)
+    return along[np.arange(len(x)), side] % 4

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: MIT
+"""Domains of soil that has flowed, renewed as the grid is reset.
+
+Yielded soil carries F by increments, so its domains are quadrature only: they may be divided anew if the new ones fill
+the same region, keep its surface, and hold what the old ones did.  Where a domain has become longer than a cell, the
+cells that it lies in are filled anew:
+
+* a full cell with its halves along each axis;
+* a cell that the surface passes through once with quadrilaterals about the centroid of what the body fills.  The
+  surface there becomes `EDGES` edges, between the ends and with the area of what it was, and with its sharp corners.
+
+What old domains have beyond these cells is cut off, and stays as it is.  Masses and volumes are exact in each cell; the
+logarithm of the elastic left Cauchy-Green tensor, and what else points carry, are means over the overlap, by mass, put
+to the new centroids by slopes fitted in each cell, within the values there: of second order.
+Cells that hold elastic soil, several bodies, sides with given displacements, or more than one pass of the surface are
+left alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
+from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.cutting import (
+    FACES,
+    centroids,
+    volumes,
+)
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space
+from mpm_dolfinx.stepping.stage import Stage
+
+LONGEST = 1.0
+"""Cells that a domain may be long; the nodes bend a longer one, whose edges are straight.  Source: definition."""
+
+
+class Renewal:
+    """Renews domains of a scene.
+
+    Parameters
+    ----------
+    grid, bodies, materials
+        Those of the scene.
+    """
+
+    def __init__(self, grid: Grid, bodies: Sequence[Body], materials: SceneMaterials):
+        self._grid = grid
+        self._bodies = bodies
+        self._starts = np.cumsum([0, *map(len, bodies)])
+        self._materials = materials
+        self._signs: Latest[tuple[NDArray, NDArray]] = Latest()
+
+    @cached_property
+    def _outer(self) -> OuterFaces:
+        """All outer faces of the bodies as seeded, ordered by key."""
+        found = []
+        for start, body in zip(self._starts, self._bodies, strict=False):
+            row, face = body.outer()
+            at = FACES[2][face]
+            X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
+            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+            found.append((start + row, face, keys(start + row, face), size, X))
+        columns = [np.concatenate(column) for column in zip(*found, strict=True)]
+        order = np.argsort(columns[2])
+        return OuterFaces(*(column[order] for column in columns))
+
+    def _faces(self, points: MaterialPoints) -> OuterFaces:
+        """Return the outer faces of points."""
+        seeded = self._outer
+        here, at = points.find(seeded.point)
+        columns = [(at, *(v[here] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
+        if PARENT in points.data:
+            at, face = np.nonzero(points.data[PARENT] >= 0)
+            columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
+        return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
+
+    def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return which domains (n,) are longer than `LONGEST` cells, or turned inside out in a part."""
+        return misshapen(self._grid, points.corners, LONGEST)
+
+    def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return which points (n,) have yielded, and have a law whose elastic strain is known."""
+        if "plastic" not in points.data:
+            return np.zeros(len(points), dtype=bool)
+        known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
+        return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
+
+    def _free(self, points: MaterialPoints, watched: NDArray[np.int64] | None) -> NDArray[np.bool_]:
+        """Return which points (n,) may be renewed."""
+        flowed = self.flowed(points)
+        return flowed if watched is None else flowed & ~np.isin(points.id, watched)
+
+    def renewed(
+        self, points: MaterialPoints, stage: Stage, watched: NDArray[np.int64] | None = None
+    ) -> tuple[MaterialPoints, int]:
+        """Return points some of whose domains are renewed, and how many were; of all processes together.
+
+        Where any should be, the first process has all points afterwards.
+
+        Parameters
+        ----------
+        points
+            The points of this process.
+        stage
+            The conditions in force.
+        watched : (m,)
+            Numbers of points that may not be renewed.
+        """
+        comm = self._grid.comm
+        free = self._free(points, watched)
+        if not over_all(comm, int((free & self.long(points)).any())):
+            return points, 0
+        if comm.size > 1:
+            points = points.migrated(Exchange(comm, np.zeros(len(points), dtype=np.int32)))
+            free = self._free(points, watched)
+        made, count = (points, 0) if comm.rank else self._renewed(points, stage, free)
+        count = over_all(comm, count)
+        return (with_faces(made) if count else made), count
+
+    def _renewed(self, points: MaterialPoints, stage: Stage, free: NDArray[np.bool_]) -> tuple[MaterialPoints, int]:
+        held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
+        signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
+        needs, body = self.long(points), body_of(points.id, self._starts)
+        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs)
+        if not work.chosen.any():
+            return points, 0
+        new = [work.full(), *work.partial(), work.rest]
+        return self._filled(points, work, new, touched)
+
+    def _signatures(
+        self, surfaces: Sequence[Surface], held: Sequence[Surface]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return for all outer faces, by key, a number of the conditions that act on them; -1 where they may not be
+        renewed.
+        """
+        key = self._outer.key
+        kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
+        barred = np.zeros(len(key), dtype=bool)
+        for k, faces in enumerate(surfaces):
+            at = np.minimum(np.searchsorted(key, keys(faces.id, faces.face)), len(key) - 1)
+            ok = key[at] == keys(faces.id, faces.face)
+            whole = np.ptp(faces.xi, axis=1).max(axis=1) >= 2
+            kind[at[ok & whole], k] = 1
+            barred[at[ok & ~whole]] = True
+        for faces in held:
+            barred |= np.isin(key, keys(faces.id, faces.face))
+        number = np.unique(kind, axis=0, return_inverse=True)[1].ravel() if len(surfaces) else np.zeros(len(key), int)
+        return key, np.where(barred, -1, number)
+
+    def _filled(
+        self, points: MaterialPoints, work: RefilledCells, new: Sequence[New], touched: Sequence[str]
+    ) -> tuple[MaterialPoints, int]:
+        """Return the points with new domains in place of those that are gone."""
+        corners, group, parent, area, ends = (np.concatenate(column) for column in zip(*new, strict=True))
+        old, at, share, of_group = work.pairs(corners, group)
+        n, mass = len(corners), points.volume0
+        J = points.J
+        weight = share * mass[old]
+        total = sum_by(at, weight, n)
+
+        x = centroids(corners)
+        off = x - np.stack([sum_by(at, weight * column, n) / total for column in points.x[old].T], axis=1)
+
+        def mean(values: NDArray) -> NDArray:
+            flat = values[old].reshape(len(old), int(np.prod(values.shape[1:])))
+            sums = [sum_by(at, weight * column, n) / total for column in flat.T]
+            if sums:
+                rise = work.rise(values.reshape(len(values), flat.shape[1]), group)
+                low, high = np.full((n, flat.shape[1]), np.inf), np.full((n, flat.shape[1]), -np.inf)
+                np.minimum.at(low, at, flat)
+                np.maximum.at(high, at, flat)
+                means = np.stack(sums, axis=1)
+                means = np.clip(means + np.einsum("ni,nik->nk", off, rise), low, high)
+                return means.reshape(n, *values.shape[1:])
+            return np.stack(sums, axis=1).reshape(n, *values.shape[1:]) if sums else np.zeros((n, *values.shape[1:]))
+
+        size = np.abs(volumes(corners))
+        count = int(group.max()) + 1
+        gone, groups, part = of_group
+        M, V = (sum_by(groups, part * of[gone], count) for of in (mass, mass * J))
+        A = sum_by(group, size, count)
+        like = np.exp(mean(np.log(J)))
+        scale = V / M * sum_by(group, size / like, count) / A  # mass and volume are both exact
+        ratio = like * scale[group]
+        volume0 = V[group] * size / A[group] / ratio
+        gone_rows = np.unique(gone)
+        material = np.zeros(n, dtype=points.material.dtype)
+        material[at] = points.material[old]
+        body = np.zeros(n, dtype=np.int64)
+        body[at] = work.body[old]
+        moved = mean(points.x - centroids(points.origin))
+        d = points.F.shape[1]
+        F = ratio[:, None, None] ** (1 / d) * np.eye(d)
+        data = {}
+        log = _log(self._elastic(points, gone_rows))
+        logs = np.zeros((len(points), 3, 3))
+        logs[gone_rows] = log
+        across = np.exp(mean(np.log(points.data[ACROSS]))) if ACROSS in points.data else None
+        data["plastic"] = _pulled(F, across, _exp(mean(logs)))
+        for name, values in points.data.items():
+            if name in touched:
+                data[name] = work.on_faces(values, corners, parent, group, points)
+            elif name == ACROSS:
+                data[name] = across
+            elif name not in (PARENT, AREA, ENDS, "plastic"):
+                data[name] = mean(values)
+        data |= {PARENT: parent, AREA: area, ENDS: ends}
+        used = points.id[points.id >= self._starts[-1]]
+        number = (used.max(initial=self._starts[-1] - 1) - self._starts[-1]) // len(self._bodies) + 1
+        made = MaterialPoints(
+            id=self._starts[-1] + body + len(self._bodies) * (number + np.arange(n)),
+            corners=corners,
+            F=F,
+            volume0=volume0,
+            material=material,
+            pressure=mean(points.pressure),
+            x=x,
+            origin=corners - moved[:, None],
+            reference=x[:, None] + (corners - x[:, None]) / ratio[:, None, None] ** 0.5,
+            data=data,
+        )
+        kept = np.ones(len(points), dtype=bool)
+        kept[gone_rows] = False
+        stay = with_faces(points).map(lambda rows: rows[kept])
+        return stay.joined(made), len(gone_rows)
+
+    def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the elastic left Cauchy-Green tensors (m, 3, 3) of some points."""
+        F = np.tile(np.eye(3), (len(rows), 1, 1))
+        seen = points.F_of_laws[rows]
+        F[:, : seen.shape[1], : seen.shape[1]] = seen
+        return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
+
+
+def _log(b: NDArray[np.float64]) -> NDArray[np.float64]:
+    value, axes = np.linalg.eigh(b)
+    return (axes * np.log(value)[:, None]) @ axes.swapaxes(1, 2)
+
+
+def _exp(e: NDArray[np.float64]) -> NDArray[np.float64]:
+    value, axes = np.linalg.eigh(e)
+    return (axes * np.exp(value)[:, None]) @ axes.swapaxes(1, 2)
+
+
+def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return C_p^-1 (n, 3, 3) of elastic left Cauchy-Green tensors b (n, 3, 3) at F."""
+    whole = np.tile(np.eye(3), (len(F), 1, 1))
+    seen = F if across is None else in_space(F, across)
+    whole[:, : seen.shape[1], : seen.shape[1]] = seen
+    back = np.linalg.inv(whole)
+    return back @ b @ back.swapaxes(1, 2)

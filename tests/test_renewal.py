@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: MIT
+"""Domains of yielded soil are renewed as the grid is reset: what they hold, fill and bound stays what it was."""
+
+from dataclasses import replace
+
+import mpi_renewal
+import numpy as np
+import penetration as demo
+import pytest
+from test_mpi import mpirun
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.points.cutting import volumes
+from mpm_dolfinx.points.polygons import Polygons
+from mpm_dolfinx.stepping import renewal
+
+CLAY = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=1e3)
+
+
+def block(conditions=(), hole=False, **options):
+    """Return a simulation of a block off the grid lines, with a round hole if asked for."""
+    grid = mpm.Grid([0, 0], [2, 1.5], [16, 12])
+    outline = [[0.07, 0.04], [1.86, 0.04], [1.86, 1.23], [0.07, 1.23]]
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    round_hole = np.stack([1 + 0.3 * np.cos(angle), 0.65 + 0.3 * np.sin(angle)], axis=1)
+    sides, holes = ["bottom", "right", "top", "left"], {"hole": round_hole} if hole else None
+    body = mpm.polygon(grid, outline, sides, holes=holes)
+    return mpm.Simulation(grid, [body], [CLAY], walls={}, conditions=list(conditions), **options)
+
+
+def yielded(s, strain, hardened=0.0):
+    """Return the points with an elastic strain (n, 2, 2) in the plane, as if they had yielded."""
+    e = np.zeros((len(s.state.points), 3, 3))
+    e[:, :2, :2] = strain
+    value, axes = np.linalg.eigh(2 * e)
+    plastic = (axes * np.exp(value)[:, None]) @ axes.swapaxes(1, 2)
+    rows = np.broadcast_to(hardened, len(e)).astype(float)
+    return replace(s.state.points, data=s.state.points.data | {"plastic": plastic, "hardened": rows})
+
+
+def renewed(s, points, monkeypatch, longest=1e-3):
+    """Return the points with domains renewed that are longer than so many cells, and how many were."""
+    monkeypatch.setattr(renewal, "LONGEST", longest)
+    own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
+    return own.renewed(points, s.state.stage)
+
+
+def strain_of(s, points):
+    """Return the elastic strains (n, 3, 3)."""
+    own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
+    return renewal._log(own._elastic(points, np.arange(len(points)))) / 2
+
+
+@pytest.mark.parametrize("hole", [False, True])
+def test_masses_volumes_region_and_surface_stay(monkeypatch, hole):
+    s = block(hole=hole)
+    old = yielded(s, 1e-3 * np.diag([1.0, -1.0]))
+    new, count = renewed(s, old, monkeypatch)
+    assert count > 0.9 * len(old)
+    assert new.volume0.sum() == pytest.approx(old.volume0.sum(), rel=1e-13)
+    assert (new.volume0 * new.J).sum() == pytest.approx((old.volume0 * old.J).sum(), rel=1e-13)
+    assert volumes(new.corners).min() > 0
+    assert volumes(new.corners).sum() == pytest.approx(volumes(old.corners).sum(), rel=1e-4)
+    own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
+    before, after = (own._faces(points) for points in (old, new))
+    assert after.area.sum() == pytest.approx(before.area.sum(), rel=1e-12)
+    for faces, points in ((before, old), (after, new)):
+        ends = np.take_along_axis(points.corners[faces.point], renewal.FACES[2][faces.face][:, :, None], axis=1)
+        assert np.abs(ends - faces.ends).max() < 2e-3  # nothing has moved
+
+
+def test_strains_that_are_linear_stay_within_second_order(monkeypatch):
+    s = block()
+    slope = 1e-3 * np.array([[1.0, 0.3], [-0.4, 0.8]])
+
+    def field(x):
+        return np.stack([[x @ slope[0], x @ slope[1]], [x @ slope[1], -(x @ slope[0])]]).transpose(2, 0, 1)
+
+    new, count = renewed(s, yielded(s, field(s.state.points.x)), monkeypatch)
+    off = strain_of(s, new)[:, :2, :2] - field(new.x)
+    assert count and np.median(np.abs(off)) < 1e-6
+    assert np.abs(off).max() < 1e-4
+
+
+def test_many_renewals_keep_what_a_body_holds(monkeypatch, count=12):
+    """It turns between them, so that other cells cut it."""
+    s = block(hole=True)
+    points = yielded(s, 1e-3 * np.diag([1.0, -1.0]), 0.1 + s.state.points.x[:, 0])
+    mass, hardened = points.volume0.sum(), points.volume0 @ points.data["hardened"]
+    R = np.array([[np.cos(0.03), -np.sin(0.03)], [np.sin(0.03), np.cos(0.03)]])
+    middle = np.array([1.0, 0.65])
+    for k in range(count):
+        turn = R if k % 20 < 10 else R.T
+        moved = {name: middle + (getattr(points, name) - middle) @ turn.T for name in ("corners", "x")}
+        points, number = renewed(s, replace(points, **moved), monkeypatch, 0.5)
+        assert number
+    assert points.volume0.sum() == pytest.approx(mass, rel=1e-12)
+    assert (points.volume0 * points.J).sum() == pytest.approx(mass, rel=1e-12)
+    assert points.volume0 @ points.data["hardened"] == pytest.approx(hardened, rel=1e-3)
+    assert len(points) < 2 * len(s.points)
+    assert volumes(points.corners).sum() == pytest.approx(mass, rel=5e-3)
+
+
+@pytest.mark.slow
+def test_a_thousand_renewals_keep_what_a_body_holds(monkeypatch):
+    test_many_renewals_keep_what_a_body_holds(monkeypatch, 1000)
+
+
+def test_elastic_soil_is_left_alone(monkeypatch):
+    s = block()
+    new, count = renewed(s, s.state.points, monkeypatch)
+    assert count == 0 and new is s.state.points
+    half = s.state.points.x[:, 0] < 1
+    some = yielded(s, 1e-3 * np.diag([1.0, -1.0]) * half[:, None, None])
+    new, count = renewed(s, some, monkeypatch)
+    _, at = new.find(some.id[~half])
+    assert count > 0 and len(at) == (~half).sum()
+    assert (new.corners[at] == some.corners[~half]).all() and (new.F[at] == some.F[~half]).all()
+
+
+def test_pressures_act_on_renewed_sides_as_before(monkeypatch):
+    """On a region of a side too: forces and moments of what acts stay."""
+    load = mpm.Pressure("top", 1e3, region=([0.5, 0], [1.31, 2]))
+    s = block([load, mpm.Traction("hole", (100.0, 200.0))], hole=True)
+    old = yielded(s, 1e-3 * np.diag([1.0, -1.0]))
+    new, count = renewed(s, old, monkeypatch)
+    found = []
+    for points in (old, new):
+        cut = s.scene.on_grid(points).cut
+        patches = cut.surfaces(s.state.stage.surfaces)
+        area = [p.area(points) for p in patches]
+        moment = [(p.X[:, 0] * a[:, 1]).sum() for p, a in zip(patches, area, strict=True)]
+        found.append([*np.sum(area[0], axis=0), *moment, *(p.area0.sum() for p in patches)])
+    assert count and found[1] == pytest.approx(found[0], rel=2e-3, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("alpha", "depth"), [(0.5, 1.25), (1.0, 1.25)])
+def test_clay_from_a_polygon_flows_around_a_bar(alpha, depth):
+    """A T-bar of a diameter of 1 m, 8 cells, in the middle of a block five diameters wide and high.
+
+    Without renewal a half rough one gives up after 0.9 diameters.
+    """
+    wide, strength, h = 2.5, 1e3, 1 / 8
+    grid = mpm.Grid([0, -wide], [wide, wide + 4 * h], [20, 44])
+    angle = np.linspace(np.pi / 2, -np.pi / 2, 33)
+    arc = np.stack([0.5 * np.cos(angle), 0.8 + 0.5 * np.sin(angle)], axis=1)
+    arc[[0, -1], 0] = 0.0
+    outline = np.concatenate([[[0, -wide], [wide, -wide], [wide, wide], [0, wide]], arc])
+    clay = mpm.polygon(grid, outline, ["bottom", "right", "top", "left", *["bar"] * 32, "left"])
+    soil = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=strength)
+    bar = mpm.Tool(mpm.Ball((0, 0.8), 0.5), lambda t: (0, -max(0, t - 1)), adhesion=alpha * strength)
+    load = mpm.Pressure("top", lambda t: 2e4 * min(1, t))
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    numerics = mpm.Numerics(renewal=True)
+    s = mpm.Simulation(grid, [clay], [soil], walls=walls, conditions=[load, bar], numerics=numerics)
+    s.run(1, 1, progress=False)
+    result = s.run(1 + depth, h / 12, progress=False)
+    N = -2 * result.tool_forces["tool"][1:, 1] / strength / demo.exact(alpha)
+    windows = N[-108:].reshape(-1, 12).mean(axis=1)
+    print(f"alpha = {alpha}: {np.round(100 * windows - 100, 2)} %; {result.cuts} of {result.steps} steps cut")
+    assert result.converged and result.renewals > 5 and result.cuts <= 0.1 * result.steps
+    assert windows[-4:] == pytest.approx(1, abs=0.03)
+    assert (N[1:] / N[:-1])[24:].min() > 0.95
+
+
+@pytest.mark.parametrize("processes", [1, 3])
+def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(processes, tmp_path):
+    """On one process to the bit."""
+    mpirun(processes, "mpi_renewal.py", str(tmp_path / "whole"))
+    mpirun(1, "mpi_renewal.py", str(tmp_path / "parts"), "restart")
+    one, other = (np.load(tmp_path / f"{name}.npz") for name in ("whole", "parts"))
+    assert one["renewed"] == other["renewed"] > 0
+    assert np.array_equal(one["id"], other["id"])
+    for name in ("x", "volume0", "plastic", "force", "shear"):
+        size = np.abs(other[name]).max()
+        assert one[name] == pytest.approx(other[name], abs=(0 if processes == 1 else 1e-7) * size)
+
+
+def test_domains_of_probes_and_those_of_a_scene_that_renews_nothing_stay(monkeypatch):
+    """A probe is put where a domain would be renewed."""
+    monkeypatch.setattr(renewal, "LONGEST", 0.6)
+
+    def run(place=None, **options):
+        simulation = mpi_renewal.pushed(**options)
+        probe = mpm.probes(simulation.bodies, [[0.99, 0.01] if place is None else place])
+        return simulation, simulation.run(0.05, 0.01, probes=probe, progress=False), probe.id[0]
+
+    simulation, result, _ = run()
+    assert result.renewed > 0 and result.renewals > 0
+    body = simulation.bodies[0]
+    gone = np.setdiff1d(np.arange(len(body)), simulation.points.id)
+    simulation, _, probe = run(body.centre_of(gone[:1])[0])
+    assert probe == gone[0] and probe in simulation.points.id
+    _, result, _ = run(renewal=False)
+    assert result.renewed == result.renewals == 0
+    with pytest.raises(ValueError, match="renewal"):
+        mpm.Numerics(renewal=1)
+
+
+def test_polygons_are_cut_and_divided():
+    ring = Polygons.rings(np.array([[[0.0, 0.0], [2, 0], [2, 2], [0, 2]]]), np.array([[0, 1, 2, 3]]))
+    half = ring.cut(np.array([[1.0, 1.0]]), np.array([2.0]))
+    assert half.area == pytest.approx([2.0]) and half.simplified(1e-9).count.tolist() == [3]
+    other = np.array([[[1.0, -1.0], [3, 1], [1, 3], [-1, 1]]])
+    within = ring.within(other)
+    row, quads, _ = within.quadrilaterals()
+    assert Polygons.rings(quads).area.sum() == pytest.approx(within.area[0]) and set(row) == {0}
+    assert np.allclose(within.centroid, [[1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fluid": mpm.Fluid()}, "has a fluid"),
+        ({"inertia": True}, "has inertia"),
+        ({"law": mpm.Hencky(1e6, 1e6)}, "no soil"),
+    ],
+)
+def test_scenes_whose_domains_cannot_be_renewed_are_refused(options, message):
+    soil = options.pop("law", mpi_renewal.CLAY)
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
+    bodies, walls = [mpm.box(grid, [0, 0], [1.0, 0.5])], {"bottom": "xy"}
+    with pytest.raises(ValueError, match=f"Numerics: renewal = True: the scene {message}.*, must be of dry soil"):
+        mpm.Simulation(grid, bodies, [soil], walls=walls, numerics=mpm.Numerics(renewal=True), **options)
