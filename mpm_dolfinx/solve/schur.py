@@ -195,7 +195,7 @@ class LinearSolvers:
         with Timer("mpm: tangent"):
             first = not self._momentum.K.assembled
             momentum.assemble_tangent(data, firmness)
-            if first and not self.plan.symmetric:
+            if first and not self.plan.symmetric and self.du.comm.size == 1:
                 renew(self._momentum.K)
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces)
