@@ -185,7 +185,7 @@ def test_tools_and_contacts_press_far_from_the_origin_as_near_it(kind):
         )
         s.run(1.0, 0.5, progress=False)
         forces.append(s.tool_forces.array)
-    moment, at_origin = forces[1][1, 2], np.cross(AWAY, forces[0][1, :2])
+    moment, at_origin = forces[1][1, 2], np.cross(AWAY, forces[1][1, :2])  # of its own force, which has `digits`
     assert moment - forces[0][1, 2] == pytest.approx(at_origin, rel=1e-9), "moments of contacts count from the origin"
     forces = [f.ravel()[:5] for f in forces]
     assert np.abs(forces[0][:2]).max() > 1e5

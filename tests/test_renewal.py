@@ -214,7 +214,7 @@ def test_polygons_are_cut_and_divided():
     [
         ({"fluid": mpm.Fluid()}, "has a fluid"),
         ({"inertia": True}, "has inertia"),
-        ({"law": mpm.Hencky(1e6, 1e6)}, "no soil"),
+        ({"law": mpm.Hencky(1e6, 1e6)}, "has no soil"),
     ],
 )
 def test_scenes_whose_domains_cannot_be_renewed_are_refused(options, message):

@@ -174,7 +174,7 @@ class RefilledCells:
         t = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, len(n), 1))
         s, row = np.concatenate([y, t], axis=2).transpose(0, 2, 1), n
         for axis in range(2):
-            s, row = _slice(s, row, axis)
+            s, row = _slice(s, row, axis, grid)
         s = np.where((s[0, 2] <= s[1, 2])[None, None], s, s[::-1])
         way = s[1, :2] - s[0, :2]
         size = np.hypot(*way)

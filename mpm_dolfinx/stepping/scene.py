@@ -240,7 +240,7 @@ class Scene:
             "has a fluid": self.fluid is not None,
             "has inertia": self.momentum.inertia is not None,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
-            "has no soil that yields": not self.materials.evolves,
+            "has no soil that yields": "plastic" not in self.materials.state_names,
         }
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
