@@ -51,7 +51,7 @@ def test_a_step_goes_on_as_the_last_one_where_soil_flows():
 def test_the_second_substep_begins_as_the_first_went_on_where_soil_flows(monkeypatch):
     """Exactly so in a steady flow; at the end of the first substep it would begin far out of balance."""
     goes_on, so_far = steps_taken(monkeypatch, 2.0), balances.going_on
-    monkeypatch.setattr(balances, "going_on", lambda *at: None if at[2].before > 0 else so_far(*at))
+    monkeypatch.setattr(balances, "going_on", lambda *at: None if at[2].substep.before > 0 else so_far(*at))
     assert goes_on < steps_taken(monkeypatch, 2.0)
 
 
