@@ -27,13 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import (
     FACES,
     centroids,
@@ -107,7 +108,7 @@ class Renewal:
     ) -> tuple[MaterialPoints, int]:
         """Return points some of whose domains are renewed, and how many were; of all processes together.
 
-        Where any should be, the first process has all points afterwards.
+        Where any should be, the first process has all points afterwards.  NotConverged, on all, where it fails.
 
         Parameters
         ----------
@@ -125,7 +126,15 @@ class Renewal:
         if comm.size > 1:
             points = points.migrated(Exchange(comm, np.zeros(len(points), dtype=np.int32)))
             free = self._free(points, watched)
-        made, count = (points, 0) if comm.rank else self._renewed(points, stage, free)
+        made, count = points, 0
+        message = ""
+        try:
+            if comm.rank == 0:
+                made, count = self._renewed(points, stage, free)
+        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # other processes would wait
+            message = str(error)
+        if message := first(comm, message):
+            raise NotConverged(f"renewal of domains: {message}")
         count = over_all(comm, count)
         return (with_faces(made) if count else made), count
 
