@@ -15,7 +15,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.conditions.conditions import Displacement
 from mpm_dolfinx.domains.cut_domains import Patches
-from mpm_dolfinx.grid.grid import Grid, rounding
+from mpm_dolfinx.grid.grid import Grid, ranges, rounding
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -167,8 +167,7 @@ def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, ND
 def check_apart(one, faces: Surface, other, others: Surface) -> None:
     """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
     first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
-    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one domain's faces
-    b = np.arange(len(a)) - np.repeat(np.cumsum(stop - first) - stop, stop - first)
+    a, b = ranges(first, stop - first)  # all pairs of parts of one domain's faces
     same = faces.face[a] == others.face[b]
     a, b = a[same], b[same]
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
-from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.points.cutting import FACES, _slice, corner_bits, cut, simplex_volumes, vertices, volumes
+from mpm_dolfinx.grid.grid import Grid, ranges, sum_by
+from mpm_dolfinx.points.cutting import FACES, corner_bits, cut, on_planes, simplex_volumes, sliced, vertices, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
@@ -168,13 +168,11 @@ class RefilledCells:
         corners = self.points.corners[faces.point]
         n = np.arange(len(faces.face))
         ends = np.stack([corners[n, START[faces.face]], corners[n, END[faces.face]]])
-        y = (ends - grid.low) / grid.h
-        nearest = np.rint(y)
-        y = np.where(np.abs(y - nearest) < grid.snap, nearest, y)
+        y = on_planes(grid, grid.in_cells(ends), ends, 2)[0]
         t = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, len(n), 1))
         s, row = np.concatenate([y, t], axis=2).transpose(0, 2, 1), n
         for axis in range(2):
-            s, row = _slice(s, row, axis, grid)
+            s, row = sliced(s, row, axis, grid)
         s = np.where((s[0, 2] <= s[1, 2])[None, None], s, s[::-1])
         way = s[1, :2] - s[0, :2]
         size = np.hypot(*way)
@@ -247,25 +245,23 @@ class RefilledCells:
         local = np.tile(y, (len(cells), 1, 1))
         return self._beside(of, local, *_no_faces(len(of)))
 
-    def partial(self) -> list[New]:
+    def partial(self) -> New:
         """Return the new domains of cells that the surface passes through."""
-        out = []
         inner = np.flatnonzero(self.parts.side == NONE)
         parts = Parts(*(column[inner] for column in self.parts))
         order = np.argsort(parts.cell, kind="stable")
         whole = sum_by(parts.cell, self.faces.area[parts.row] * np.ptp(parts.t, axis=1), self.cells)
-        for rows, local, surface in self.region.quadrilaterals(self.chosen):
-            cells = self.region.cells[rows]
-            parent, area, ends = _no_faces(len(cells))
-            at, face = np.nonzero(surface)
-            lower, upper = (local[at, FACES[2][face, k]] for k in (0, 1))
-            key, X = self._nearest(parts, order, cells[at], lower, upper)
-            parent[at, face], ends[at, face] = key, X
-            edge = np.linalg.norm(upper - lower, axis=1)
-            total = sum_by(cells[at], edge, self.cells)  # of both edges that it becomes
-            area[at, face] = edge / total[cells[at]] * whole[cells[at]]
-            out.append(self._beside(cells, local, parent, area, ends))
-        return out
+        rows, local, surface = self.region.quadrilaterals(self.chosen)
+        cells = self.region.cells[rows]
+        parent, area, ends = _no_faces(len(cells))
+        at, face = np.nonzero(surface)
+        lower, upper = (local[at, FACES[2][face, k]] for k in (0, 1))
+        key, X = self._nearest(parts, order, cells[at], lower, upper)
+        parent[at, face], ends[at, face] = key, X
+        edge = np.linalg.norm(upper - lower, axis=1)
+        total = sum_by(cells[at], edge, self.cells)  # of all edges that it becomes
+        area[at, face] = edge / total[cells[at]] * whole[cells[at]]
+        return self._beside(cells, local, parent, area, ends)
 
     def _nearest(
         self,
@@ -280,10 +276,8 @@ class RefilledCells:
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
-        edge = np.repeat(np.arange(len(cells)), stop - first)
-        part = order[
-            np.arange(len(edge)) - np.repeat(np.cumsum(stop - first) - (stop - first), stop - first) + first[edge]
-        ]
+        edge, at = ranges(first, stop - first)
+        part = order[at]
         a, way = parts.x[part, 0], parts.x[part, 1] - parts.x[part, 0]
         found = []
         for place in ((lower + upper) / 2, lower, upper):
@@ -321,9 +315,14 @@ class RefilledCells:
         bordered = Parts(parts.row[on], place, parts.x[on], parts.t[on], parts.side[on])
         length = np.linalg.norm(bordered.x[:, 1] - bordered.x[:, 0], axis=1)
         seeded = self.faces.area[bordered.row] * np.ptp(bordered.t, axis=1)
+        count = 4 * self.cells
+        dense = sum_by(place, seeded, count) / np.maximum(sum_by(place, length, count), TINY)
         known = np.unique(place)
         for side in range(4):
             axis, end = divmod(side, 2)
+            low, high = np.full(count, np.inf), np.full(count, -np.inf)  # the parts may end within the side
+            np.minimum.at(low, place, bordered.x[:, :, 1 - axis].min(axis=1))
+            np.maximum.at(high, place, bordered.x[:, :, 1 - axis].max(axis=1))
             for face in range(4):
                 a, b = (local[:, k] for k in FACES[2][face])
                 flat = (np.abs(a[:, axis] - end) < NEAR) & (np.abs(b[:, axis] - end) < NEAR)
@@ -333,13 +332,8 @@ class RefilledCells:
                     continue
                 here = 4 * cells[at] + side
                 key, X = self._nearest(bordered, order, here, a[at], b[at])
-                # the parts may end within the side
                 middle = (a[at, 1 - axis] + b[at, 1 - axis]) / 2
-                low, high = np.full(4 * self.cells, np.inf), np.full(4 * self.cells, -np.inf)
-                np.minimum.at(low, place, bordered.x[:, :, 1 - axis].min(axis=1))
-                np.maximum.at(high, place, bordered.x[:, :, 1 - axis].max(axis=1))
                 covered = (middle > low[here]) & (middle < high[here])
-                dense = sum_by(place, seeded, 4 * self.cells) / np.maximum(sum_by(place, length, 4 * self.cells), TINY)
                 at, here = at[covered], here[covered]
                 key, X = key[covered], X[covered]
                 parent[at, face], ends[at, face] = key, X
@@ -435,9 +429,8 @@ class RefilledCells:
         share = share / whole[pieces.point[piece]]  # of slivers that are dropped
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
-        count = stop - first
-        of = np.repeat(np.arange(len(piece)), count)
-        at = order[np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + first[of]]
+        of, at = ranges(first, stop - first)
+        at = order[at]
         old = pieces.point[piece[of]]
         common = np.zeros(len(of))
         rings, which = _convex(self.points.corners[old])

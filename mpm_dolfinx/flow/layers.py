@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.fluxes import CellContents, Mobility
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ASLANT = 0.01
@@ -96,10 +96,8 @@ class MixedCells:
 
         first, count (m,): of the pieces in each piece's cell.
         """
-        own = np.arange(rows.start, rows.stop)
-        line = np.repeat(own, count[rows])
-        begin = np.cumsum(count[rows]) - count[rows]
-        piece = np.repeat(first[rows] - begin, count[rows]) + np.arange(len(line))
+        line, piece = ranges(first[rows], count[rows])
+        line += rows.start
         inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / NEAR + 0.5
         out = []
         for axis in range(self._x.shape[1]):

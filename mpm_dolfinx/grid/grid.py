@@ -61,6 +61,12 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
 
 
+def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the range (n,) of each whole number in ranges (m,), and the numbers (n,): count of them from first on."""
+    of = np.repeat(np.arange(len(count)), count)
+    return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
+
+
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Return which numbers (...) are among chosen ones (m,), ascending: numpy's isin makes room for all numbers."""
     if not len(chosen):

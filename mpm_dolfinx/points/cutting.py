@@ -216,7 +216,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Piece
     return Pieces(*map(np.concatenate, columns))
 
 
-def _on_planes(
+def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return places in cells from the grid's lower corner, and as edges are straight: what is near planes on them.
@@ -253,7 +253,7 @@ def _in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
 def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     d, true = grid.dim, np.ascontiguousarray(grid.in_cells(corners).transpose(1, 2, 0))
     x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
-    in_cells, y = _on_planes(grid, true, x, 1)
+    in_cells, y = on_planes(grid, true, x, 1)
     v = vertices(y)
     volume = simplex_volumes(v)
     flat = np.flatnonzero(~volume.any(axis=0))
@@ -274,7 +274,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
         owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
     facet = np.arange(s.shape[2])
     for axis in range(d):
-        s, facet = _slice(s, facet, axis, grid)
+        s, facet = sliced(s, facet, axis, grid)
     s = _in_cells(grid, s)
     area = _area_vectors(s)
     area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
@@ -537,7 +537,7 @@ def cut_faces(
     middle (n, d) of the part of the face in one cell that it belongs to.
     """
     d, m = grid.dim, len(corners)
-    y = _on_planes(grid, grid.in_cells(corners), corners, 2)[1]
+    y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
     both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
     split = [(0, 1)]
     if d == 3:
@@ -551,7 +551,7 @@ def cut_faces(
     s = np.concatenate([whole, np.repeat(np.eye(d)[:, :, None], count, axis=2)], axis=1)  # shares of the corners, too
     owner = np.arange(count)
     for axis in range(d):
-        s, owner = _slice(s, owner, axis, grid)
+        s, owner = sliced(s, owner, axis, grid)
     kept = np.flatnonzero(_size(s[:, -d:-1]) * share[owner] > SLIVER)  # what only touches a plane leaves nothing
     s, owner = s[:, :, kept], owner[kept]
     if d == 3:
@@ -643,7 +643,7 @@ _RULES = {  # Source: Gauss, Strang and Fix (1973); of equal weight, exact to th
 }
 
 
-def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
+def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
     """Slice simplices, as edges are straight, by the grid planes of an axis until none crosses a plane."""
     done_s, done_owner = [], []
     while True:

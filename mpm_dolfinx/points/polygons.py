@@ -35,6 +35,12 @@ class Polygons:
         return Polygons(self.x[rows], self.count[rows], self.edge[rows])
 
     @property
+    def after(self) -> NDArray[np.float64]:
+        """The next vertex (n, k, 2), m, after each."""
+        last = np.arange(self.x.shape[1]) == self.count[:, None] - 1
+        return np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
+
+    @property
     def area(self) -> NDArray[np.float64]:
         """Areas (n,), m^2."""
         return self._moments[0]
@@ -62,8 +68,7 @@ class Polygons:
         n, k = self.edge.shape
         here = np.arange(k) < self.count[:, None]
         beyond = np.where(here, np.einsum("nki,ni->nk", self.x, normal) - level[:, None], 0.0)
-        last = np.arange(k) == self.count[:, None] - 1
-        x1 = np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
+        last, x1 = np.arange(k) == self.count[:, None] - 1, self.after
         beyond1 = np.where(last, beyond[:, :1], np.roll(beyond, -1, axis=1))
         inside = beyond <= 0
         crosses = here & (inside != (beyond1 <= 0))
@@ -87,9 +92,7 @@ class Polygons:
         """Return the polygons without vertices that lie as near, m, to the one before."""
         k = self.edge.shape[1]
         here = np.arange(k) < self.count[:, None]
-        last = np.arange(k) == self.count[:, None] - 1
-        x1 = np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
-        return _packed(self.x, self.edge, here & (np.abs(x1 - self.x).max(axis=2) > near))
+        return _packed(self.x, self.edge, here & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
         """Return a fan of quadrilaterals about the first vertices.

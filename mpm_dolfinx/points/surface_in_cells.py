@@ -69,8 +69,7 @@ class Region:
         ring = Polygons(x, self._size, np.full(x.shape[:2], NONE))
         self.area = ring.area
         self._middle = ring.centroid
-        after = np.where((np.arange(most) == self._size[:, None] - 1)[:, :, None], x[:, :1], np.roll(x, -1, axis=1))
-        a, b = x - self._middle[:, None], after - self._middle[:, None]
+        a, b = x - self._middle[:, None], ring.after - self._middle[:, None]
         sees = a[:, :, 0] * b[:, :, 1] - a[:, :, 1] * b[:, :, 0]
         sees = np.where(np.arange(most) < self._size[:, None], sees, 1.0)
         self.sound = (sees.min(axis=1) > 0) & (self.area > NEAR)
@@ -83,9 +82,8 @@ class Region:
 
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
-    ) -> list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
         """Return rows (m,) of this, corners (m, 4, 2) of the domains there, and which faces (m, 4) are the surface."""
-        out = []
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -102,8 +100,7 @@ class Region:
             corners.append(domain)
             of.append(at)
             surface.append(on)
-        out.append((np.concatenate(of), np.concatenate(corners), np.concatenate(surface)))
-        return out
+        return np.concatenate(of), np.concatenate(corners), np.concatenate(surface)
 
 
 def resampled(

@@ -35,11 +35,7 @@ from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_fac
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
-from mpm_dolfinx.points.cutting import (
-    FACES,
-    centroids,
-    volumes,
-)
+from mpm_dolfinx.points.cutting import FACES, centroids, volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space
 from mpm_dolfinx.stepping.stage import Stage
 
@@ -145,15 +141,13 @@ class Renewal:
         work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs)
         if not work.chosen.any():
             return points, 0
-        new = [work.full(), *work.partial(), work.rest]
+        new = [work.full(), work.partial(), work.rest]
         return self._filled(points, work, new, touched)
 
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return for all outer faces, by key, a number of the conditions that act on them; -1 where they may not be
-        renewed.
-        """
+        """Return the keys of all outer faces, and numbers of what acts on each; -1 where it may not be renewed."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -185,15 +179,15 @@ class Renewal:
         def mean(values: NDArray) -> NDArray:
             flat = values[old].reshape(len(old), int(np.prod(values.shape[1:])))
             sums = [sum_by(at, weight * column, n) / total for column in flat.T]
-            if sums:
-                rise = work.rise(values.reshape(len(values), flat.shape[1]), group)
-                low, high = np.full((n, flat.shape[1]), np.inf), np.full((n, flat.shape[1]), -np.inf)
-                np.minimum.at(low, at, flat)
-                np.maximum.at(high, at, flat)
-                means = np.stack(sums, axis=1)
-                means = np.clip(means + np.einsum("ni,nik->nk", off, rise), low, high)
-                return means.reshape(n, *values.shape[1:])
-            return np.stack(sums, axis=1).reshape(n, *values.shape[1:]) if sums else np.zeros((n, *values.shape[1:]))
+            if not sums:
+                return np.zeros((n, *values.shape[1:]))
+            rise = work.rise(values.reshape(len(values), flat.shape[1]), group)
+            low, high = np.full((n, flat.shape[1]), np.inf), np.full((n, flat.shape[1]), -np.inf)
+            np.minimum.at(low, at, flat)
+            np.maximum.at(high, at, flat)
+            means = np.stack(sums, axis=1)
+            means = np.clip(means + np.einsum("ni,nik->nk", off, rise), low, high)
+            return means.reshape(n, *values.shape[1:])
 
         size = np.abs(volumes(corners))
         count = int(group.max()) + 1
