@@ -413,8 +413,6 @@ class FluxForms:
             carried = T * ufl.avg(self.density)
             self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
-        self.even = None
-        """Where pores drain, the slope of the fluxes but for that of what the weight drives: outflows rise with it."""
         if (weight is not None or relative is not None) and flows:
             # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
             # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
@@ -430,14 +428,13 @@ class FluxForms:
                         d0 * (k1 / resists) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resists) ** 2 * ufl.diff(k1, k)
                     )
 
-                whole, even = (
-                    density * (T * ufl.jump(dp) + by * sum(rises)) * ufl.jump(q) * dS
-                    for by, rises in (
-                        (drives, [by_k(one.k) * _along(dp, one.slopes) for one in between]),
-                        (ufl.jump(pressure), [by_k(one.k) * _along(dp, one.even) for one in between]),
-                    )
+                # no cell loses less as it gets wetter, or more as its neighbour does: rounding would turn the direction
+                own, other = (
+                    T * sign + drives * sum(by_k(one.k) * one.slopes[side] for one in between)
+                    for side, sign in enumerate((1, -1))
                 )
-                self.flux, self.even = FacetForm(whole, grid.comm), FacetForm(even, grid.comm)
+                slope = ufl.max_value(own, 0.0) * dp("+") + ufl.min_value(other, 0.0) * dp("-")
+                self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
 
     def along(
         self,
@@ -478,8 +475,3 @@ class FluxForms:
             f.x.array.reshape(-1, d)[filled] = rows
             f.x.scatter_forward()
         return mobility
-
-
-def _along(dp, slopes: tuple):
-    """Return what changes by slopes on both sides of a face, as UFL."""
-    return slopes[0] * dp("+") + slopes[1] * dp("-")

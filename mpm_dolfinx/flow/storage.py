@@ -42,7 +42,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
-from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME
+from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
@@ -52,7 +52,6 @@ from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.active import Active
-from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
@@ -276,8 +275,8 @@ class StorageSystem:
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
-        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity, fluxes.even)
-        self._flux, self.damp, self._alternation, self.gravity, self._even = (f and f.on(facets) for f in kinds)
+        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
+        self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
         pattern = self.L
@@ -330,14 +329,13 @@ class StorageSystem:
             aslant = AslantFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
 
-    def assemble_fluxes(self, even: bool = False) -> None:
-        """Assemble the matrix of the fluxes between cells, where pores drain at p; even: see `FluxForms`."""
+    def assemble_fluxes(self) -> None:
+        """Assemble the matrix of the fluxes between cells, where pores drain at p."""
         zero(self.T)
         if (relative := self._forms.fluxes.relative) is not None:
             relative.set_pressures(self._forms.p.x.array)
-        flux = self._even if even else self._flux
-        if flux is not None:
-            flux.assemble_matrix(self.T)
+        if self._flux is not None:
+            self._flux.assemble_matrix(self.T)
         self.T.assemble()
 
 
@@ -641,19 +639,9 @@ class StorageProblem:
             zero(A)
             insert_rows(A, forms.grid, data.places.filled, rows)
             A.assemble()
-        self._assemble_slope(capacity)
-        if forms.fluxes.relative is not None and over_all(forms.grid.comm, int(_falls(system.C))) > 0:
-            self._assemble_slope(capacity, even=True)
-
-    def _assemble_slope(self, capacity: NDArray[np.float64], even: bool = False) -> None:
-        """Assemble C; even: without how the weight drives more as soil gets wetter.
-
-        In coarse cells, and where dry soil stores next to nothing, that turns Newton's direction round.
-        """
-        system = self.system
-        if self.forms.fluxes.relative is not None:
+        if forms.fluxes.relative is not None:
             self._flow(False)
-            system.assemble_fluxes(even)
+            system.assemble_fluxes()
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
@@ -681,15 +669,6 @@ class StorageProblem:
         system.P.axpy(-factor * share, system.L, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.P, factor * self._contents.fixed_stress)
         return system.P
-
-
-def _falls(A: PETSc.Mat) -> bool:
-    """Return whether a row of a matrix has a diagonal that is not positive, or another entry that is, by its size."""
-    starts, columns, values = A.getValuesCSR()
-    row = np.repeat(np.arange(len(starts) - 1), np.diff(starts)) + A.getOwnershipRange()[0]
-    size = sum_by(row - A.getOwnershipRange()[0], np.abs(values), len(starts) - 1)
-    least = ROUND_OFF * size[row - A.getOwnershipRange()[0]]
-    return bool((np.where(row == columns, values <= 0, values > least)).any())
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:
