@@ -82,8 +82,8 @@ def check_held(
             )
             raise ValueError(
                 f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
-                "it must be constrained by walls that it touches, by prescribed displacements, or by contact with a tool "
-                "or a constrained group"
+                "it must be constrained by walls that it touches, by prescribed displacements, or by contact with "
+                "a tool or a constrained group"
             )
 
 
