@@ -215,7 +215,7 @@ CASES = {
     "a plate on two columns": (
         lambda: scene(APART, conditions=[mpm.RigidPlate("top", 1.0)]),
         "RigidPlate(side='top'",
-        "do not hang together",
+        "are not connected at one height",
     ),
     "a plate on a step": (
         lambda: scene(STEP, conditions=[mpm.RigidPlate("top", 1.0)]),
