@@ -112,8 +112,7 @@ class FormPoints:
         """Return grad u at the point as a coefficient that numpy evaluates; u is a Q1 vector function.
 
         UFL derivatives with respect to u do not include it. All forms at the same u share its values. The Taylor series
-        has many terms in 3D. There a kernel of Hencky's law takes a quarter to half of the time, and its compilation a
-        fifth.
+        has many terms in 3D. There a kernel of Hencky's law takes at most half of the time, its compilation a fifth.
         """
         if "gradient" not in self.live:
             self.follow("gradient", (self.grid.dim, self.grid.dim), lambda data: data.gradients(u))

@@ -112,8 +112,7 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has dropped on all processes. The call is collective.
 
     On several processes PETSc keeps dropped objects, because their order may differ between processes. Releases before
-    3.20 or so also keep the objects of a single process. Without this call a run keeps the matrices and factors of all
-    its steps.
+    3.20 or so also keep the objects of a single process. Without this call a run keeps the matrices of all its steps.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)

@@ -123,8 +123,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     Raises
     ------
     ValueError
-        The file is not a complete checkpoint, or it belongs to another scene; the message names the difference. The
-        simulation is unchanged.
+        The file is not a complete checkpoint, or belongs to another scene; the message says why. The simulation is
+        unchanged.
     OSError
         The file does not exist (FileNotFoundError) or cannot be read.
     """

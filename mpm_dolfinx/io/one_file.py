@@ -25,8 +25,8 @@ def one_file(folder: str | os.PathLike) -> Path:
     ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read it. dolfinx reads the particle domains of one output time as
     a mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third. Each output time has its own
     domains, so bodies may be excavated and placed in between. `<Information>` in points.xdmf describes the fields and
-    their units. The files of the `Writer` are kept. During a run the function writes the output times so far; call it
-    again at the end.
+    their units. The files of the `Writer` are kept. During a run it writes the output times so far; call it again at
+    the end.
 
     Parameters
     ----------

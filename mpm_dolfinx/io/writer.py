@@ -50,8 +50,8 @@ class Writer:
     * `points.pvd`: the particle domains as solid cells. Their fields are displacement, pore pressure, F, J, all data of
       the points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
     * `history.csv`: one row for each output time, with counts of `Result`, least and largest pressure, records of
-      probes, forces of prescribed displacements and tools, and outflows. The last two are nan before the first step of
-      a stage;
+      probes, forces of prescribed displacements and tools, and outflows. The last two are nan until a stage's first
+      step;
     * `fields.txt`: meaning and unit of each of these fields;
     * with tools, `tools.pvd`: the parts of the grid's cells inside the tools, with the forces of the tools;
     * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`), by components, zero in empty cells.
@@ -80,8 +80,7 @@ class Writer:
         An argument of the wrong type; files in the folder that no writer has written, or with other columns; a run of
         another simulation, or one that starts at another time; a closed writer.
     OSError
-        The folder is not writable, or the disk is full. `simulation.run(..., after=simulation.result)` continues the
-        run.
+        The folder is not writable, or the disk is full. `simulation.run(..., after=simulation.result)` continues.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):

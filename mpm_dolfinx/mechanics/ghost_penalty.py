@@ -2,8 +2,8 @@
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
 The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment of the step. Nearly empty cells then
-affect neither the conditioning nor the accuracy. The penalty is a viscosity of the step, so it must not act on the
-cells that carry the load:
+affect neither the conditioning nor the accuracy. The penalty is a viscosity of the step, so it must not act on
+load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 as the filling of the emptier over the fuller cell rises to RATIO. A second
   factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell). Empty cells thus

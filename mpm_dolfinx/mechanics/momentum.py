@@ -7,8 +7,8 @@ derivative of
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
 
 that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions. P' is the first
-Piola-Kirchhoff effective stress relative to the start of the step. A law may also give the stress directly. UFL takes
-the derivatives.
+Piola-Kirchhoff effective stress relative to the start of the step. A law may also give the stress. UFL takes the
+derivatives.
 """
 
 from __future__ import annotations

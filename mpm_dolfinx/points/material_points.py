@@ -95,8 +95,8 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: the mean over the domain, of second order. The state has the pressures
-        of cells and pieces.
+        Pore pressure, positive in compression: the mean over the domain, of second order. Cells and pieces have their
+        own.
     x : (n, d), m
         Centroid of the domain, in axisymmetry of its section: F and pressure of linear fields are exact there.
     origin : (n, 2^d, d), m
