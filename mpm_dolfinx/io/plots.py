@@ -30,7 +30,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
         "mean_effective_stress", "deviatoric_stress", "porosity", "J", and any other scalar in `points.pvd` and
         `points.data`.
     ax
-        Axes to draw into; by default those of a new figure.
+        Axes to draw into; by default new ones.
     bar
         Draw a colour bar with the unit.
     label

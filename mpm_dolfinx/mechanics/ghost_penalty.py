@@ -35,8 +35,7 @@ GHOST = 0.05
 YIELDING = 0.02
 """Least factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""A cell with a smaller filling, relative to a neighbour, is nearly empty: the face between the two carries the
-penalty.
+"""A cell with a smaller filling, relative to a neighbour, is nearly empty: the face between them is penalised.
 
 Plateau (soil): halved 1.3e-03, doubled 5.9e-04, cells 3.0e-02.
 """

@@ -108,7 +108,7 @@ def moving(
     base : (d,), m
         Origin of the points' coordinates.
     rings
-        Whether the domains are rings of an axisymmetric scene, whose centroids are those of the volumes.
+        Whether the domains are rings of an axisymmetric scene, with centroids of volumes.
 
     Raises
     ------
@@ -241,7 +241,7 @@ class InertiaForms:
         fill : (cells,)
             Volume fraction of the local cells.
         facets
-            Faces between two active cells, at least one of which is not full.
+            Faces between two active cells, at least one not full.
         unknowns, held
             Unknown displacements, and displacements that grid boundary conditions fix.
         """

@@ -120,7 +120,7 @@ class MeanDilatation:
         return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar) by F and by theta; for a law without an energy, those of its work."""
+        """Return the derivatives of psi(Fbar) by F and by theta; for a law without an energy, of its work."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -241,7 +241,7 @@ class StressAtPoints:
         self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
         stress = points.follow("stress of the law", shape, self._stress)
         self.P = block(stress) if points.grid.axisymmetric else stress
-        """The stress as UFL; its values are those of the last evaluation."""
+        """The stress as UFL, with the values of the last evaluation."""
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
         """Evaluate stress and derivative at the points; return the sums (cells, 1) of the derivative in their cells."""

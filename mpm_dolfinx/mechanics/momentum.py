@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Balance of momentum: Q1 on the grid, integrated over the cut subdomains of the particle domains.
 
-The displacement increment of the step is u, with Delta = I + grad u, F = Delta F_n and J = det F. The residual is the
+The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J = det F. The residual is the
 derivative of
 
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
@@ -179,7 +179,7 @@ class MomentumForms:
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u, a local array, with those of `Loads.takes_up`."""
+        """Return the nodal forces of the stresses at u, a local array, with `Loads.takes_up`."""
 
         def solve() -> None:
             for number, local in self._local.items():

@@ -50,7 +50,7 @@ def told_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step; those of each part (`SceneMaterials.parts`); rows of each part in the former."""
+    """Integration points of a step; points of each part (`SceneMaterials.parts`); rows of each part in the former."""
 
     pieces: PointData
     parts: tuple[PointData, ...]

@@ -462,7 +462,7 @@ def _rings(
     cell (m, 2): indices; c (m, 2): centroids in the plane, from 0 to 1; squares, products (m,): means of r^2 and r z.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
-    squares = np.clip(squares, x**2, x)  # rounding may spoil those of slivers
+    squares = np.clip(squares, x**2, x)  # slivers may lose them in rounding
     products = np.clip(products, np.maximum(0.0, x + z - 1), np.minimum(x, z))
     inner = grid.low[0] + h * cell[:, 0] if grid.even else grid.lines[0][cell[:, 0]]
     radius = inner + h * x

@@ -265,7 +265,7 @@ class Simulation:
             Whether bodies have inertia from now on; only if the scene allows it. Bodies then start at rest.
         conditions
             All conditions from now on; by default the active ones stay. `[*simulation.conditions, more]` adds one.
-            Contacts are those of the scene, named or not.
+            Contacts always stay, named or not.
         add
             Indices of bodies in `later`: a fill, at rest and without stress. It is placed on the present surface of the
             bodies that it touched when seeded; its opposite side stays at its seeded position.

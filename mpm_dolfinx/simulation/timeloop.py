@@ -255,7 +255,7 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return histories that begin with the present state, or those to continue, and the step control."""
+    """Return new histories from the present state, or the histories to continue, and the step control."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
@@ -265,7 +265,7 @@ def _histories(
         begun = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), begun
     if latest is None or control is None or after.rows.run is not latest.rows.run:
-        raise ValueError("after: histories of another run, must be those of the last one, or a result of `resume`")
+        raise ValueError("after: histories of another run, must be of the last one, or a result of `resume`")
     after = latest  # which may have advanced since
     now = state.t
     start = after.rows[0]
@@ -283,7 +283,7 @@ def _histories(
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with new energies, with those of a continued run, or without energies."""
+    """Return the state with new energies, with the energies of a continued run, or without."""
     if energies and not state.stage.inertia:
         raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
