@@ -126,7 +126,7 @@ class Renewal:
         try:
             if comm.rank == 0:
                 made, count = self._renewed(points, stage, free)
-        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # told to all below
+        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised on all below
             message = str(error)
         if message := first(comm, message):
             raise NotConverged(f"renewal of domains: {message}")
