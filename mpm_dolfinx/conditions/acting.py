@@ -208,11 +208,8 @@ class Loads:
         """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
         return False
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
-        """Go on with other forces where the balance is met; return whether they differ.
-
-        unknown (cells,): how well the balance tells forces in the local cells, N.
-        """
+    def augment(self, at: At) -> bool:
+        """Go on with other forces where the balance is met; return whether they differ."""
         return False
 
     def follow(self, at: At) -> bool:

@@ -315,7 +315,7 @@ class ContactProblem(Loads):
             self.now = self.now._replace(ways=self._linearised(w, way))
         return changed
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
+    def augment(self, at: At) -> bool:
         """Augment the pressures where means penetrate too deep at u; return whether they do.
 
         Where they do not, tools that do not meet their loads go on to where they may.

@@ -26,9 +26,12 @@ class Unknowns:
         Any function of the space, for its ghost pattern.
     dofs
         Unrolled local degrees of freedom that are unknowns, ghosts included.
+    x : (entities, d), m
+        Positions of this process's nodes or cells; None: the space computes all of them on each request.
     """
 
-    def __init__(self, function: fem.Function, dofs: NDArray[np.int64]):
+    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
+        self._x = x
         self._space = space = function.function_space
         self.comm = space.mesh.comm
         owned = space.dofmap.index_map.size_local * space.dofmap.bs
@@ -61,7 +64,8 @@ class Unknowns:
     @property
     def positions(self) -> NDArray[np.float64]:
         """Positions (n, d), m, of the entries of the vectors."""
-        return self._space.tabulate_dof_coordinates()[self.owned // self.dim, : self._space.mesh.geometry.dim]
+        x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
+        return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
         """Return a new vector with the given entries of this process."""

@@ -33,7 +33,10 @@ class Velocity:
         """Return whether a form depends on the velocity."""
         return self._past in form.coefficients()
 
-    def set(self, own: float, past: float) -> None:
-        """Set the coefficients of the rate: own, the time increment, s, and past, a fraction of the present u."""
+    def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
+        """Set the coefficients of the rate: own, the time increment, s, and past, a fraction of the present u.
+
+        dofs: the active degrees of freedom.
+        """
         self._own.value = own
-        self._past.x.array[:] = past * self._u.x.array
+        self._past.x.array[dofs] = past * self._u.x.array[dofs]

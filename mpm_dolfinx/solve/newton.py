@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from mpi4py import MPI
 
@@ -210,9 +211,8 @@ class Newton:
         self._storage = storage
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
-        self._functions = [momentum.forms.u] + ([storage.forms.p] if storage is not None else [])
-        systems = [momentum.system] + ([storage.system] if storage is not None else [])
-        self._parts = [system.local_parts for system in systems]
+        forms, active = momentum.forms, momentum.forms.active
+        self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
         """Solve both problems by Newton's method; the tangent is kept while it converges, for linear laws over steps.
@@ -264,7 +264,7 @@ class Newton:
     def _augmented(self, errors: Errors) -> Errors:
         """Return the errors after updates of contact pressures and slip, repeated while the balance holds."""
         momentum = self._momentum
-        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment(errors.forces)):
+        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
             errors = self._errors(errors.start)
         return errors
 
@@ -287,7 +287,7 @@ class Newton:
                 continue
             better = found.u < least  # p is the same, and before any fluid has moved its residual is meaningless
             if better.any():
-                at = guess if better.all() else np.where(better[self._parts[0]], guess, at)
+                at = guess if better.all() else np.where(better[self._parts], guess, at)
                 least, last = np.minimum(found.u, least), at if better.all() else None
         if last is not at:
             self._go_to([at, *start[1:]])
@@ -295,13 +295,19 @@ class Newton:
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
     def _iterate(self) -> list[NDArray[np.float64]]:
-        """Return a copy of the present (u, p), local arrays, m and Pa."""
-        return [f.x.array.copy() for f in self._functions]
+        """Return a copy of the present (u, p) where these are active, m and Pa."""
+        return [f.x.array[rows] for f, rows in self._functions]
+
+    @cached_property
+    def _parts(self) -> NDArray[np.int64]:
+        """Parts of the active degrees of freedom."""
+        momentum = self._momentum
+        return momentum.system.parts.nodes[momentum.forms.active.dofs // momentum.forms.grid.dim]
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
         """Set (u, p)."""
-        for f, values in zip(self._functions, iterate, strict=True):
-            f.x.array[:] = values
+        for (f, rows), values in zip(self._functions, iterate, strict=True):
+            f.x.array[rows] = values
 
     def check_stable(self) -> None:
         """Refuse an unstable equilibrium: smaller steps find the path that leaves it.
@@ -425,7 +431,8 @@ class Newton:
             measures = forces, np.maximum(errors.exchanged, least)
             if not slow or self._linear or self._storage.forms.retains:
                 return self._solvers.solve(self._kept, rtol, *measures)
-            slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
+            forms = self._momentum.forms
+            slope = self._storage.flux_slope(forms.u, self._momentum.system.unknowns, forms.active.dofs)
             count = self._solvers.solve(self._kept, rtol, *measures, slope)
             self._storage.set_fluxes()
             return count

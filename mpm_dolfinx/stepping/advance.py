@@ -104,15 +104,14 @@ class Motion:
             The bodies on the grid, and their integration points at the start of the step.
         loads
             Loads at the end of the step.
-        came : (cells,), m^d
-            Net fluid inflow into the local cells in the step; None leaves the points' volume defect unchanged.
+        came : (n,), m^d
+            Net fluid inflow into the filled owned cells in the step; None leaves the points' volume defect unchanged.
         report
             Report of the step, for the exception if a point leaves the grid.
         stays
             Whether pieces may stay in their cells where points hardly move.
         carried
-            Function of the motion (n,) of points in cells, 0 without reset, that returns their velocities; see
-            `Mass.carried`.
+            Function of the motion (n,) of points in cells, 0 without reset, for their velocities; see `Mass.carried`.
 
         Raises
         ------
@@ -306,10 +305,11 @@ class Motion:
         materials = self._materials
         forms = self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
-        volume = sum_by(cut.cells, here, len(came))[cut.cells]
+        at = on_grid.contents.slot(cut.cells)
+        volume = on_grid.contents.total(cut.cells, here)[at]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
         density = np.exp((p + p_n) / (2 * forms.bulk))
-        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[cut.cells] / volume))
+        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[at] / volume))
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)
