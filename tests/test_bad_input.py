@@ -88,7 +88,7 @@ CASES = {
     "body of no extent": (lambda: mpm.box(GRID, [0.5, 0.5], [0.5, 0.8]), "body: box", "[0.5, 0.5] to [0.5, 0.8]"),
     "body from nan": (lambda: mpm.box(GRID, [NAN, 0.5], [0.5, 0.8]), "body: lower", "nan"),
     "body of another dimension": (lambda: mpm.box(GRID, [0, 0, 0], [1, 1, 1]), "body: lower", "[0, 0, 0]"),
-    "body of nothing": (lambda: mpm.shape(GRID, lambda x: x[:, 0] > 2), "body: inside(x)", "no point of the grid"),
+    "body of nothing": (lambda: mpm.shape(GRID, lambda x: x[:, 0] > 2), "body: inside(x)", "is False at all points"),
     "body of too many answers": (lambda: mpm.shape(GRID, lambda x: x > 0.5), "body: inside(x)", "(400, 2)"),
     "body bent out of the grid": (lambda: mpm.mapped(GRID, BODY, lambda x: x + 2), "body: the map", "[2.  2.2]"),
     "body bent inside out": (

@@ -372,7 +372,7 @@ def test_a_path_that_cannot_be_names_the_object_and_the_path(make, tmp_path):
 @pytest.mark.parametrize("body", [BODY, mpm.mapped(GRID, BODY, lambda x: 1.1 * x)], ids=["box", "mapped"])
 def test_a_body_that_is_named_twice_is_refused(body):
     check_different([body, UPPER, mpm.box(GRID, [0, 0.2], [0.5, 0.5])])  # as large and in the same place: to come later
-    with pytest.raises(ValueError, match=r"^bodies 0 and 2: are one and the same, must be two[^\n]*$"):
+    with pytest.raises(ValueError, match=r"^bodies 0 and 2: are the same object, must be two[^\n]*$"):
         check_different([body, UPPER, body])
 
 

@@ -56,21 +56,12 @@ from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts
-from mpm_dolfinx.pores.retention import Retentions, logarithm, pressure_at
+from mpm_dolfinx.pores.retention import Retentions, restrained
 
 FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
 
 Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
-"""
-
-
-FARTHEST = np.log(10)
-"""Change of the logarithm of the suction in a Newton step, at most; without one dry soil beside wet finds no solution.
-
-Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
-
-Plateau (dry): halved 7.6e-10, doubled 9.8e-10, cells 6.6e-03.
 """
 
 
@@ -523,22 +514,10 @@ class StorageProblem:
         return SAME if self.forms.retains else 1.0
 
     def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
-
-        Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for
-        the saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  The logarithm of the
-        suction changes by at most `FARTHEST`.
-        """
+        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,)."""
         if self._scale is None:
             return dp
-        p, turn = self.forms.p.x.array[self.system.unknowns.owned], -self._scale
-        there = p - dp
-        there = np.where((p - turn) * (there - turn) < 0, turn, there)
-        here, y = logarithm(p, self._scale), logarithm(there, self._scale)
-        far = (np.abs(y - here) > FARTHEST) & (np.minimum(here, y) < 0)
-        y = here + np.clip(y - here, -FARTHEST, FARTHEST)
-        there = np.where(far, pressure_at(y, self._scale), there)
-        return np.where(there == p - dp, dp, p - there)
+        return restrained(self.forms.p.x.array[self.system.unknowns.owned], dp, self._scale)
 
     def settle(self) -> bool:
         """Open and close what asks for it by the flow at (u, p); return whether that has changed anything.
