@@ -90,7 +90,7 @@ def check_held(
 def _extents(
     grid: Grid, cells: NDArray[np.int64], part: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of the parts of cells."""
+    """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of parts."""
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):
         np.minimum.at(ends, part, sign * grid.midpoints[cells])
