@@ -180,7 +180,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; they need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, rows of points end at
-        grid lines.  A value of 1 makes thin bodies too flexible (with a warning), and errors ten times those of 2.
+        grid lines.  A value of 1 makes thin bodies too flexible (with a warning), and errors ten times as large as 2.
     material
         Index of the material in the scene's list, >= 0.
 
