@@ -89,7 +89,7 @@ class Pairs:
 class ToolPairs(Pairs):
     """Points on faces that face tools.
 
-    tools, poses (contacts,): tools, and their poses at its end, with displacements by loads before the step; now,
+    tools, poses (contacts,): tools, and their poses, with displacements by loads up to the start of the step; now,
     carried (m, d): position of the point at the start of the step, and its image under the motion of the tool, m.
     Shears are rotated with the tool.
     """
