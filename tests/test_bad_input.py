@@ -298,7 +298,6 @@ CASES = {
     "elements fixed at an unknown side": (lambda: fem(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
     "elements fixed by an unknown component": (lambda: fem(walls={"left": "q"}), "walls: 'left'", "'q'"),
     "elements drained without fluid": (lambda: fem(conditions=[mpm.Drained("top")]), "drained", "fluid"),
-    "elements with fluid and gravity": (lambda: fem(fluid=WATER, gravity=lambda t: (0, 1)), "gravity", "fluid"),
     "elements loaded nowhere": (
         lambda: fem(conditions=[mpm.Traction("top", (0, 1), region=((2, 0), (3, 1)))]),
         "side 'top'",

@@ -208,11 +208,8 @@ class Loads:
         """Update the slipping set at u and, if sticks, let points return to stick; return whether the set changed."""
         return False
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
-        """Update the multipliers at equilibrium; return whether forces changed.
-
-        unknown (cells,): force, N, in each local cell below which equilibrium is not resolved.
-        """
+    def augment(self, at: At) -> bool:
+        """Update the multipliers at equilibrium; return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:

@@ -184,9 +184,9 @@ class FreeTools(ContactProblem):
         self.now = self.now._replace(ways=self._goes(w, travel))
         return changed
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
+    def augment(self, at: At) -> bool:
         """See `Loads`: tools must be in equilibrium too."""
-        if super().augment(at, unknown):
+        if super().augment(at):
             return True
         found = self.found(at)
         met = self._met(found)

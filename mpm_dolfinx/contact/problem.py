@@ -315,7 +315,7 @@ class ContactProblem(Loads):
             self.now = self.now._replace(ways=self._linearised(w, way))
         return changed
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
+    def augment(self, at: At) -> bool:
         """Augment the pressures if mean penetrations at u are too large; return whether forces changed.
 
         Otherwise move tools whose reaction differs from their load.

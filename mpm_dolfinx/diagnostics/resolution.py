@@ -30,12 +30,11 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
     """Warn about the fullest cell and its bodies if domains overlap in it; return the function for the next check."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
-    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)
-    fill /= grid.volumes(np.arange(grid.num_owned))
+    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
         return warn_overfilled
-    number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
+    number = over_all(grid.comm, int(grid.cell_number[cut.cells[fill.argmax()]]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
     who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
     warn(

@@ -43,8 +43,8 @@ def check_held(
         With the place of the part and its number of free rigid-body modes.
     """
     part, count = parts_of_cells(grid, active) if each else (active.astype(np.int64), 1)
-    centre, size = _extents(grid, part, count)
     cells = np.flatnonzero(active)
+    centre, size = _extents(grid, cells, part[cells] - 1, count)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
     row, axis = np.nonzero(~free[nodes])
     x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
@@ -87,10 +87,12 @@ def check_held(
             )
 
 
-def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of the parts."""
+def _extents(
+    grid: Grid, cells: NDArray[np.int64], part: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of parts."""
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):
-        np.minimum.at(ends, part[part > 0] - 1, sign * grid.midpoints[part > 0])
+        np.minimum.at(ends, part, sign * grid.midpoints[cells])
         grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
     return (low - high) / 2, (-high - low + (grid.h if grid.even else grid.most)).max(axis=1)

@@ -103,13 +103,12 @@ class ElementForces:
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
-        self._grid = points.grid
         self._sums = CellSums(along_shapes(stress, points), points)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        dofs = element_dofs(self._grid, data.places.filled)
-        b += sum_by(dofs.ravel(), self._sums(data).ravel(), len(b))
+        dofs, at = data.places.dofs
+        b[dofs] += sum_by(at, self._sums(data).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):

@@ -200,6 +200,13 @@ class Places(Keyed):
         d = self.grid.dim
         return (self.grid.cell_nodes[self.filled] * d + np.arange(d)[:, None, None]).transpose(0, 2, 1).copy()
 
+    @cached_property
+    def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Unrolled local dofs (n,) of Q1 vectors in the filled cells, and the places of each cell's among them."""
+        d = self.grid.dim
+        nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
+        return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
+
     def part(self, rows: NDArray[np.int64]) -> Places:
         """Return some of the places."""
         mixed, hoop = (None if values is None else values[rows] for values in (self.mixed, self.hoop))
@@ -273,8 +280,8 @@ class PointData(Keyed):
 
     def gradients(self, u: fem.Function) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector function at its present values."""
-        now = u.x.array.copy()  # of the key nothing changes
-        return self._gradients(now, lambda: self.gradients_of(now))
+        nodal = u.x.array.take(self.places.nodal)
+        return self._gradients(nodal, lambda: self._of_nodal(nodal))
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (n, 9), in axisymmetry with hoops, of a Q1 vector function with these values."""
@@ -285,10 +292,14 @@ class PointData(Keyed):
 
     def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector function with these values, a local array."""
+        return self._of_nodal(u.take(self.places.nodal))
+
+    def _of_nodal(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the same by values at the nodes of the filled cells, see `Places.nodal`."""
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim
-        of_cells = grid.over_edges(grid.monomials @ u.take(places.nodal), places.filled)
+        of_cells = grid.over_edges(grid.monomials @ nodal, places.filled)
         out = np.empty((len(self.cells), d, d))
         # component by component: rows of a few numbers each would take numpy six times as long
         for axis in range(d):

@@ -27,9 +27,12 @@ class Unknowns:
         Any function of the space; its ghost pattern is used.
     dofs
         Unrolled local degrees of freedom, ghosts included, that are unknowns.
+    x : (entities, d), m
+        Where the nodes or cells of this process are; asked of the space without, which finds all of them each time.
     """
 
-    def __init__(self, function: fem.Function, dofs: NDArray[np.int64]):
+    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
+        self._x = x
         self._space = space = function.function_space
         self.comm = space.mesh.comm
         owned = space.dofmap.index_map.size_local * space.dofmap.bs
@@ -62,7 +65,8 @@ class Unknowns:
     @property
     def positions(self) -> NDArray[np.float64]:
         """Where the entries of the vectors are (n, d), m."""
-        return self._space.tabulate_dof_coordinates()[self.owned // self.dim, : self._space.mesh.geometry.dim]
+        x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
+        return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
         """Return a new vector with these entries of this process."""

@@ -33,7 +33,10 @@ class Velocity:
         """Return whether a form depends on it."""
         return self._past in form.coefficients()
 
-    def set(self, own: float, past: float) -> None:
-        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it."""
+    def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
+        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it.
+
+        dofs: the active degrees of freedom.
+        """
         self._own.value = own
-        self._past.x.array[:] = past * self._u.x.array
+        self._past.x.array[dofs] = past * self._u.x.array[dofs]

@@ -110,18 +110,24 @@ class GhostPenalty:
             strength = SPARSE
         return strength * 2 * moduli[0] * moduli[1] / (moduli[0] + moduli[1])
 
-    def set_contents(self, volume: NDArray[np.float64], *moduli: NDArray[np.float64]) -> None:
-        """Set volumes (cells,), m^d, of what the owned cells hold, and `modulus` and `shear`, Pa, times volume."""
+    def set_contents(
+        self, own: NDArray[np.int64], volume: NDArray[np.float64], *moduli: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Set the contents of the owned cells (n,) that are not empty; return all active local cells, ascending.
+
+        Volumes (n,), m^d, and `modulus` and `shear`, Pa, times volume (n,); `fill` is zero before.
+        """
         grid, fill = self.grid, self.fill.x.array
-        fill[:] = volume / grid.volumes(np.arange(grid.num_local))
+        fill[own] = volume / grid.volumes(own)
         for f, total in zip((self.modulus, self.shear), moduli, strict=True):
-            f.x.array[:] = np.divide(total, volume, out=np.zeros_like(total), where=volume > 0)
+            f.x.array[own] = total / volume
         for f in (self.fill, self.modulus):
             f.x.scatter_forward()
-        own = np.arange(grid.num_owned)
+        ghosts = grid.num_owned + np.flatnonzero(fill[grid.num_owned :])
         neighbours = grid.facet_cells[grid.cell_facets[own]].sum(axis=2) - own[:, None]  # -1 where there is none
         self.beside.x.array[own] = np.where(neighbours >= 0, fill[neighbours], 0.0).max(axis=1, initial=0.0)
         self.beside.x.scatter_forward()
+        return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
         """Return the penalty on faces of this process, and on those of them in cells that walls hold nodes of."""

@@ -31,6 +31,7 @@ from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatric
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
+from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -41,7 +42,7 @@ from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.weight import Weight
-from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
+from mpm_dolfinx.points.parts import OfParts, Parts, relative
 from mpm_dolfinx.pores.retention import Retentions
 
 
@@ -120,6 +121,9 @@ class MomentumForms:
         self.elastic = not any(law.state for law, *_ in laws)
         """Whether no law has a history: where soil yields, the tangent of one substep leads the next astray."""
         self.ghost = GhostPenalty(grid, V, at_points)
+        kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *self._rooms)]
+        self.active = Active(grid, pressure is not None, *kept)
+        """The active cells; u is zero at other nodes."""
 
     def _add_law(
         self,
@@ -165,10 +169,17 @@ class MomentumForms:
         else:
             self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
 
+    def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Set the contents of the owned cells (n,) that are not empty, and what is active: see `GhostPenalty`."""
+        self.active.clear()
+        cells = self.ghost.set_contents(own, *contents)
+        self.active.set(cells, np.flatnonzero(self.active_nodes(cells)))
+        return cells
+
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
         """Return the sum of the nodal forces that are added, of all processes, in one of the rooms for local arrays."""
         out = self._rooms[room]
-        out.x.array[:] = 0.0
+        out.x.array[self.active.dofs] = 0.0
         for add in adders:
             add(out.x.array)
         return sum_ghosts(out)
@@ -204,26 +215,29 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (nodes,) at the local nodes of what owned cells, of all processes, have (cells,)."""
-        shared, nodes = self._rooms[0], self.grid.cell_nodes[cells]
-        sums = sum_by(nodes.ravel(), np.repeat(values, nodes.shape[1]), len(self.grid.node_x))
-        shared.x.array[:] = np.repeat(sums, self.grid.dim)
+        """Return the sums (nodes,) at the active local nodes of what owned cells, of all processes, have (cells,)."""
+        shared, d = self._rooms[0], self.grid.dim
+        nodes, at = np.unique(self.grid.cell_nodes[cells], return_inverse=True)
+        shared.x.array[self.active.dofs] = 0.0
+        shared.x.array[nodes * d] = sum_by(at.ravel(), np.repeat(values, 2**d), len(nodes))
         sum_ghosts(shared)
         shared.x.scatter_forward()
-        return shared.x.array[:: self.grid.dim].copy()
+        return shared.x.array[self.active.nodes * d]
 
-    def parts(self, active: NDArray[np.bool_]) -> Parts:
-        """Return the parts of the bodies in active cells (cells,).
+    def parts(self, of: NDArray[np.int64], count: int) -> Parts:
+        """Return the parts of the bodies in active cells by those of the cells, see `parts_of_cells`.
 
         Groups press on one another through their contacts: they are one part.
         """
-        of, count = parts_of_cells(self.grid, active)
-        if self.grid.copies > 1:
-            of, count = active.astype(np.int64), 1
-        own = np.flatnonzero(active[: self.grid.num_owned])
-        total, cells = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
-        nodes = np.divide(total, cells, out=np.zeros(len(cells)), where=cells > 0)
-        return Parts(count, of - 1, np.rint(nodes).astype(np.int64) - 1)
+        grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
+        if grid.copies > 1:
+            cells = np.full(grid.num_local, -1)
+            cells[self.active.cells] = nodes[self.active.nodes] = 0
+            return Parts(1, cells, nodes)
+        own = self.active.cells[self.active.cells < grid.num_owned]
+        total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
+        nodes[self.active.nodes] = np.rint(total / count_of).astype(np.int64) - 1
+        return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return which nodes belong to some active cells of any process."""
@@ -270,7 +284,8 @@ class MomentumSystem:
         parts: Parts,
     ):
         self._forms, d = forms, forms.grid.dim
-        self.unknowns = Unknowns(forms.u, dofs)
+        self._nodes = nodes
+        self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
         self.locks = forms.dilatation is not None
         """Whether laws yield or hardly change their volume."""
         owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
@@ -286,22 +301,17 @@ class MomentumSystem:
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         every = (nodes[:, None] * d + np.arange(d)).ravel()
-        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs))
+        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs), forms.grid.node_x)
         """What walls hold."""
         self.held_residual = self.held.vector()
         self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
         at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
-        at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
+        at_walls[np.setdiff1d(every, dofs) // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
         self._ghost = forms.ghost.on(facets, facets[near])
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
-
-    @property
-    def local_parts(self) -> NDArray[np.int64]:
-        """Parts (n,) of the degrees of freedom of this process, ghosts included, -1 where nothing is."""
-        return np.repeat(self.parts.nodes, self.unknowns.dim)
 
     @property
     def round_off(self) -> NDArray[np.float64]:
@@ -313,8 +323,8 @@ class MomentumSystem:
         return self._touched.norms(forces)
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
-        """Set what rounding may leave of the residual at the local nodes, N."""
-        self.rounding.array_w[:] = nodes[self.unknowns.owned // self.unknowns.dim]
+        """Set what rounding may leave of the residual at the active local nodes, N."""
+        self.rounding.array_w[:] = nodes[np.searchsorted(self._nodes, self.unknowns.owned // self.unknowns.dim)]
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], ...] | None:
@@ -421,24 +431,19 @@ class MomentumProblem:
         """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
-    def augment(self, forces: NDArray[np.float64]) -> bool:
-        """Let what is in balance go on with other forces, or at other places; return whether these are others.
-
-        forces (parts,): what residuals are measured by, N.
-        """
-        unknown = (self.system.round_off + self._tolerance * forces)[self.system.parts.cells]
-        return any([one.augment(self.at, unknown) for one in self.loads]) or any(
-            [one.follow(self.at) for one in self.loads]
-        )
+    def augment(self) -> bool:
+        """Let what is in balance go on with other forces, or at other places; return whether these are others."""
+        return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
 
     def guesses(self) -> list[NDArray[np.float64]]:
-        """Return displacements (local unknowns,), m, at which Newton's method may begin.
+        """Return displacements (active dofs,), m, at which Newton's method may begin.
 
         Those that loads guess, as of a turn, and those of bodies that move on as before.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
-        return [np.where(self.system.unknowns.map.indices >= 0, values, 0.0) for values in found]
+        dofs = self.forms.active.dofs
+        return [np.where(self.system.unknowns.map.indices[dofs] >= 0, values[dofs], 0.0) for values in found]
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""

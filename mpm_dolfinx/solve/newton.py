@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from mpi4py import MPI
 
@@ -211,9 +212,8 @@ class Newton:
         self._storage = storage
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
-        self._functions = [momentum.forms.u] + ([storage.forms.p] if storage is not None else [])
-        systems = [momentum.system] + ([storage.system] if storage is not None else [])
-        self._parts = [system.local_parts for system in systems]
+        forms, active = momentum.forms, momentum.forms.active
+        self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
         """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
@@ -265,7 +265,7 @@ class Newton:
     def _augmented(self, errors: Errors) -> Errors:
         """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
         momentum = self._momentum
-        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment(errors.forces)):
+        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
             errors = self._errors(errors.start)
         return errors
 
@@ -288,7 +288,7 @@ class Newton:
                 continue
             better = found.u < least  # of no other p: where no fluid has moved yet the storage tells nothing
             if better.any():
-                at = guess if better.all() else np.where(better[self._parts[0]], guess, at)
+                at = guess if better.all() else np.where(better[self._parts], guess, at)
                 least, last = np.minimum(found.u, least), at if better.all() else None
         if last is not at:
             self._go_to([at, *start[1:]])
@@ -296,13 +296,19 @@ class Newton:
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
     def _iterate(self) -> list[NDArray[np.float64]]:
-        """Return a copy of the present (u, p), local arrays, m and Pa."""
-        return [f.x.array.copy() for f in self._functions]
+        """Return a copy of the present (u, p) where these are active, m and Pa."""
+        return [f.x.array[rows] for f, rows in self._functions]
+
+    @cached_property
+    def _parts(self) -> NDArray[np.int64]:
+        """Parts of the active degrees of freedom."""
+        momentum = self._momentum
+        return momentum.system.parts.nodes[momentum.forms.active.dofs // momentum.forms.grid.dim]
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
         """Set (u, p)."""
-        for f, values in zip(self._functions, iterate, strict=True):
-            f.x.array[:] = values
+        for (f, rows), values in zip(self._functions, iterate, strict=True):
+            f.x.array[rows] = values
 
     def check_stable(self) -> None:
         """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.
@@ -426,7 +432,8 @@ class Newton:
             measures = forces, np.maximum(errors.exchanged, least)
             if not slow or self._linear or self._storage.forms.retains:
                 return self._solvers.solve(self._kept, rtol, *measures)
-            slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
+            forms = self._momentum.forms
+            slope = self._storage.flux_slope(forms.u, self._momentum.system.unknowns, forms.active.dofs)
             count = self._solvers.solve(self._kept, rtol, *measures, slope)
             self._storage.set_fluxes()
             return count

@@ -104,8 +104,8 @@ class Motion:
             The bodies on the grid, and their pieces at the start of the step.
         loads
             What acts at the end of the step.
-        came : (cells,), m^d
-            Fluid that came to the local cells in the step; without, what is owed to the points stays as it is.
+        came : (n,), m^d
+            Fluid that came to the filled owned cells in the step; without, what is owed to the points stays as it is.
         report
             What the step took, which is told of where a point leaves the grid.
         stays
@@ -305,10 +305,11 @@ class Motion:
         materials = self._materials
         forms = self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
-        volume = sum_by(cut.cells, here, len(came))[cut.cells]
+        at = on_grid.contents.slot(cut.cells)
+        volume = on_grid.contents.total(cut.cells, here)[at]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
         density = np.exp((p + p_n) / (2 * forms.bulk))
-        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[cut.cells] / volume))
+        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[at] / volume))
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)

@@ -73,6 +73,7 @@ class OnGrid(Keyed):
         self.cut = cut
         self._quadrature = quadrature
         self._storage, self._u = storage, momentum.u
+        self._momentum = momentum
         self._places = quadrature.places(cut)
         self.data = quadrature.data(cut, self._places, points)
         """The pieces when the grid was reset."""
@@ -82,12 +83,16 @@ class OnGrid(Keyed):
         area, x = cut.plane(weight)
         scales = stiffness, lambda m: m.shear if m.state else 0.0  # what never yields is firm enough
         moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
-        self.active = momentum.ghost.fill.x.array > 0
-        """Which local cells hold something, ghosts included."""
-        self.fill = momentum.ghost.fill.x.array.copy()
+        own, slots = self._places.pieces.filled, self._places.pieces.slots
+        contents = (sum_by(slots, rows, len(own)) for rows in (area, *moduli))
+        self.cells = momentum.set_contents(own, *contents)
+        """Local cells that hold something, ghosts included."""
+        self.active = np.zeros(grid.num_local, dtype=bool)
+        """Which local cells these are."""
+        self.active[self.cells] = True
+        self.fill = np.zeros(grid.num_local)
         """Filled shares of the local cells."""
-        self.cells = np.flatnonzero(self.active)
+        self.fill[self.cells] = momentum.ghost.fill.x.array[self.cells]
         self.facets = grid.interior_facets(self.active, self.cells)
         """Faces of this process between two active cells."""
         self.penalised = momentum.ghost.facets(self.facets)
@@ -107,7 +112,7 @@ class OnGrid(Keyed):
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
-            self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
+            self.contents = CellContents(storage.fluxes, brought, own, self.cells)
             if quadrature.materials.retentions is not None:
                 lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
                 self._places = replace(self._places, lever=lever)
@@ -145,7 +150,7 @@ class OnGrid(Keyed):
             p_n = self._storage.p_n.x
             p_n.array[self.contents.filled] = self.pressures(state)
             p_n.scatter_forward()
-        self._storage.p.x.array[:] = p_n.array
+        self._storage.p.x.array[self.cells] = p_n.array[self.cells]
 
     def pressures(self, state: State) -> NDArray[np.float64]:
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
@@ -198,18 +203,20 @@ class OnGrid(Keyed):
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
         """Give the pieces when the grid was reset; within it displacements are none, and pressures those of then."""
-        functions = [self._u] if self._storage is None else [self._u, self._storage.p, self._storage.p_n]
-        now = [f.x.array.copy() for f in functions]
-        self._u.x.array[:] = 0.0
+        at = [(self._u.x.array, self._momentum.active.dofs)]
+        if self._storage is not None:
+            at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
+        now = [values[rows] for values, rows in at]
+        self._u.x.array[self._momentum.active.dofs] = 0.0
         if self._storage is not None:
             if state.stay:
                 self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
-            self._storage.p.x.array[:] = self._storage.p_n.x.array
+            self._storage.p.x.array[self.cells] = self._storage.p_n.x.array[self.cells]
         try:
             yield self.data
         finally:
-            for f, values in zip(functions, now, strict=True):
-                f.x.array[:] = values
+            for (values, rows), before in zip(at, now, strict=True):
+                values[rows] = before
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
@@ -259,7 +266,7 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        seen = self._cell_pressures(mass_potential(p_n, bulk), stage, t, bulk, at_rest)
+        seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
@@ -299,7 +306,8 @@ class OnGrid(Keyed):
 
         t, s: time at which drained sides have their pressures; at_rest: pressures of the fluid at rest, where it flows.
         """
-        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t, at_rest=at_rest)
+        places, p = self._places.pieces, self._storage.p.x.array
+        seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
         x, middle = self.cut.plane(self.weight)[1], self.cut.grid.midpoints[self.cut.cells]
         pressures = reconstruction.up_to_surface(seen, x - middle, places.slots)
         if at_rest is not None:
@@ -309,20 +317,23 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
+        """Return what slopes of cells with pressures p (cells,), Pa, are drawn from: by their mass potentials.
 
-        at_rest: pressures of the fluid at rest, from which these then are the differences.
+        bulk: of the fluid, Pa; at_rest: pressures of the fluid at rest, from which these then are the differences.
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
         sides = open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        cells, seen = self.cells, np.zeros(len(p))
+        seen[cells] = mass_potential(p[cells], bulk)
         if at_rest is not None:
-            x = self.cut.grid.midpoints + contents.centroid
-            p = p - at_rest(np.arange(len(x)), x)
-            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, x[sides.cells] + sides.reach))
-        outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
-        return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
+            middle, centroid = self.cut.grid.midpoints, contents.centroid
+            seen[cells] -= at_rest(cells, middle[cells] + centroid[cells])
+            beyond = middle[sides.cells] + centroid[sides.cells] + sides.reach
+            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, beyond))
+        outer = sides.ahead(contents.slot(sides.cells), seen[contents.filled])
+        return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
@@ -406,12 +417,17 @@ class OnGrid(Keyed):
         return self.cut.serves(points, part, count)[part]
 
     @cached_property
+    def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
+        """Which of these parts each local cell belongs to (cells,), from 1, 0 where it is empty; and their number."""
+        return parts_of_cells(self.cut.grid, self.active)
+
+    @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
         """Which of the parts that hang together, from 0, each point belongs to (n,), and how many there are.
 
         A part has unknowns of its own: what happens in another one it does not see.
         """
-        part, count = parts_of_cells(self.cut.grid, self.active)
+        part, count = self.parts_of_cells
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -420,7 +436,7 @@ class OnGrid(Keyed):
     def active_cells(self) -> int:
         """Number of active cells of all processes."""
         grid = self.cut.grid
-        return int(grid.comm.allreduce(int(self.active[: grid.num_owned].sum())))
+        return int(grid.comm.allreduce(int((self.cells < grid.num_owned).sum())))
 
 
 class System:
@@ -456,7 +472,7 @@ class System:
         self._scheme = scheme
         self.symmetric = symmetric
         self.storage = None
-        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(on_grid.active)
+        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(*on_grid.parts_of_cells)
         self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -538,17 +554,17 @@ class Assembled(Keyed):
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
-        """Return what rounding may leave of the residual at the local nodes (nodes,), N.
+        """Return what rounding may leave of the residual at the active local nodes (nodes,), N.
 
         It goes with the stiffness of the cells about a node, and with that of what acts there.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
-        everywhere = np.arange(grid.num_local)
-        of_cells = ROUND_OFF * on_grid.stiffness * grid.volumes(everywhere) / grid.sizes(everywhere).min(axis=-1)
+        cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
+        of_cells[cells] = ROUND_OFF * on_grid.stiffness[cells] * grid.volumes(cells) / grid.sizes(cells).min(axis=-1)
         for one in loads:
             of_cells = one.rounding(of_cells)
-        own = np.flatnonzero(on_grid.active[: grid.num_owned])
-        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
+        own = cells[cells < grid.num_owned]
+        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells at a flat side
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
@@ -594,20 +610,24 @@ class Assembled(Keyed):
 
         mixture = ()
         if self._by_pressure is not None:
-            mixture = (self._by_pressure.x.array.copy(),)
+            mixture = (self._by_pressure.x.array[on_grid.cells],)
             varies = (*varies, *mixture)
         if state.stays and not self._varies:
-            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
-            return feeds, lambda begins: outflow
+            of_cut = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
+            return feeds, lambda begins: of_cut
         rests = on_grid.rests(state) if not self._varies else None
 
-        def at_present(begins: bool) -> Outflow:
-            motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
-            return set_fluxes(mobility(begins), motion)
+        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
+            return set_fluxes(mobility(begins), contents.motion(nodal, rests))
 
         # a substep begins where the one before it has ended
         at_u = (data.pieces.key, weight, *varies)
-        return feeds, lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
+
+        def outflow(begins: bool) -> Outflow:
+            nodal = contents.nodal(u.x.array.reshape(-1, grid.dim))
+            return self._outflow((*at_u, nodal), lambda: at_present(nodal, begins), grid.comm)
+
+        return feeds, outflow
 
 
 def assembled(
@@ -628,7 +648,7 @@ def assembled(
         A body, or at the start of a stage a part of one, is free to move as a rigid body.
     """
     grid, free = on_grid.cut.grid, stage.free
-    nodes = np.flatnonzero(momentum.active_nodes(on_grid.cells))
+    nodes = momentum.active.nodes
     dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
     stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
 

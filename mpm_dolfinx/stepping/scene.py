@@ -129,7 +129,19 @@ class Scene:
             law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
             kind = (symmetric, scene.conducts, scene.evolves)
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
-            forms = (pieces, u, p, fluid.bulk, weight, *kind, law, feeding, inertial, scene.retentions)
+            forms = (
+                pieces,
+                u,
+                p,
+                self.momentum.active,
+                fluid.bulk,
+                weight,
+                *kind,
+                law,
+                feeding,
+                inertial,
+                scene.retentions,
+            )
             self.storage = StorageForms(*forms)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
@@ -175,9 +187,10 @@ class Scene:
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
             self.gravity.value = when.gravity
-        self.momentum.velocity.set(when.own, when.past)
+        self.momentum.velocity.set(when.own, when.past, self.momentum.active.dofs)
         if self.storage is not None:
-            self.storage.p_before.x.array[:] = self.storage.p.x.array
+            cells = self.momentum.active.cells
+            self.storage.p_before.x.array[cells] = self.storage.p.x.array[cells]
         if u is not None:
             self.momentum.u.x.array[:] = u
         return MomentumProblem(self.momentum, system, data, loads, self.scheme.tolerance, **options)
