@@ -243,7 +243,7 @@ def shape(
     if filled.shape != (len(index),) or filled.dtype != bool:  # such as a signed distance
         raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     if not filled.any():
-        raise ValueError("body: inside(x) is False at all points, must be True at one; the body may be below a cell")
+        raise ValueError("body: inside(x) is False at all points, must be True at one: is it below a cell in size?")
     numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
     if not grid.even:
         return check_inside(grid, _lattice(rows, filled=numbers_of, material=material))

@@ -87,7 +87,7 @@ def from_mesh(
     if isinstance(mesh, meshio.Mesh):
         if not (cell_tags is None or isinstance(cell_tags, str)) or facet_tags is not None:
             raise ValueError(
-                "mesh: cell_tags and facet_tags must be of a dolfinx mesh; or cell_tags a name of cells' data"
+                "mesh: cell_tags and facet_tags must be tags of a dolfinx mesh, or cell_tags the name of cell data"
             )
         found = _of_meshio(grid, mesh, names, cell_tags, name)
     else:
