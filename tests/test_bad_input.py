@@ -229,7 +229,7 @@ CASES = {
     "pressure in no region": (
         lambda: sides("Pressure", "top", 1.0, region=((0.8, 0), (1, 1))),
         "Pressure(side='top'",
-        "must be one of a body",
+        "must be a side of a body",
     ),
     "traction of nan": (lambda: sides("Traction", "top", (0, NAN)), "Traction(side='top'", "nan"),
     "traction that goes wrong": (

@@ -307,13 +307,13 @@ BAD = {
     "generated nodes": (lambda f: written(f, SETS + "*NGEN\n1, 2\n"), "scene.inp: *NGEN", "one by one"),
     "cylindrical coordinates": (lambda f: written(f, SETS.replace("NSET=ALL", "SYSTEM=C")), "SYSTEM=C", "Cartesian"),
     "no type": (lambda f: written(f, SETS.replace(" TYPE=CAX4,", "")), "*ELEMENT: has no TYPE", "must"),
-    "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 is there twice", "once"),
-    "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 is there twice", "once"),
+    "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 occurs twice", "once"),
+    "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 occurs twice", "once"),
     "an unknown set": (lambda f: written(f, SETS.replace("A, b", "A, c")), "set 'C' of elements", "A, base, B"),
     "an unknown part": (lambda f: written(f, PARTS.replace("part=Wall", "part=Wa")), "*INSTANCE Wall-1", "'Wa'"),
     "nodes of two parts where they touch": (
         lambda f: written(f, PARTS.replace(" 3., 1., 0.\n 3., 1., 0., 3., 1., 1., 90.\n", " 1.,\n")),
-        "scene.inp: ", "hanging or doubled nodes, which must be merged, or be of two parts"),
+        "scene.inp: ", "hanging or duplicate nodes, must be merged, or belong to two parts"),
     "half a turn": (lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: 3 and 5", "7 of a turn"),
     "an old format of gmsh": (
         lambda f: written(f, "$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "a.msh"), "a.msh: gmsh's format 4.0", "2.2"),

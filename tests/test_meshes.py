@@ -439,7 +439,7 @@ BAD = {
     "hanging nodes": (
         lambda: seed(HANGING, [("quad", [[0, 1, 2, 3], [1, 4, 7, 6], [6, 7, 5, 2]])]),
         "mesh: ",
-        "hanging or doubled nodes",
+        "hanging or duplicate nodes",
     ),
     "three cells at a facet": (
         lambda: seed([*SQUARE, (0.5, 0.7, 0)], [("triangle", [[0, 1, 2], [0, 1, 3], [0, 1, 4]])]),
@@ -454,7 +454,7 @@ BAD = {
     "cells of third order": (lambda: seed(SQUARE, [("triangle10", [[0, 1, 2] * 3 + [3]])]), "mesh: ", "'triangle10'"),
     "a cell twice": (
         lambda: seed(SQUARE, [("quad", [[0, 1, 2, 3], [1, 2, 3, 0]])]),
-        "mesh: 1 cells (quad) are there more than once",
+        "mesh: 1 cells (quad) occur more than once",
         "[0.5 0.5]",
     ),
     "a quadrilateral and its triangles": (
