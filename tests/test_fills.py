@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A fill is put onto the present surface of what it was seeded to touch, with no gap and no overlap, at rest."""
+"""A fill is placed on the present surface of its seeded neighbours, without gap or overlap, at rest."""
 
 import numpy as np
 import pytest
@@ -181,7 +181,9 @@ def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
     bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
     s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, later=[1])
     s.stage(fields={"damage": np.arange(len(s.points))})
-    with pytest.raises(ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given anew"):
+    with pytest.raises(
+        ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given for all points"
+    ):
         s.stage(add=[1])
     s.stage(add=[1], fields={"damage": np.arange(sum(map(len, bodies)))})
     assert (s.points.data["damage"] == np.arange(len(s.points))).all()

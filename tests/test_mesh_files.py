@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of meshes: what they say is where they say it, or it is refused in one line."""
+"""Mesh files: elements and sides are where the file has them, or the file is refused in one line."""
 
 import struct
 
@@ -307,13 +307,13 @@ BAD = {
     "generated nodes": (lambda f: written(f, SETS + "*NGEN\n1, 2\n"), "scene.inp: *NGEN", "one by one"),
     "cylindrical coordinates": (lambda f: written(f, SETS.replace("NSET=ALL", "SYSTEM=C")), "SYSTEM=C", "Cartesian"),
     "no type": (lambda f: written(f, SETS.replace(" TYPE=CAX4,", "")), "*ELEMENT: has no TYPE", "must"),
-    "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 is there twice", "once"),
-    "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 is there twice", "once"),
+    "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 occurs twice", "once"),
+    "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 occurs twice", "once"),
     "an unknown set": (lambda f: written(f, SETS.replace("A, b", "A, c")), "set 'C' of elements", "A, base, B"),
     "an unknown part": (lambda f: written(f, PARTS.replace("part=Wall", "part=Wa")), "*INSTANCE Wall-1", "'Wa'"),
     "nodes of two parts where they touch": (
         lambda f: written(f, PARTS.replace(" 3., 1., 0.\n 3., 1., 0., 3., 1., 1., 90.\n", " 1.,\n")),
-        "scene.inp: ", "hanging or doubled nodes, which must be merged, or be of two parts"),
+        "scene.inp: ", "hanging or duplicate nodes, must be merged, or belong to two parts"),
     "half a turn": (lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: 3 and 5", "7 of a turn"),
     "an old format of gmsh": (
         lambda f: written(f, "$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "a.msh"), "a.msh: gmsh's format 4.0", "2.2"),
@@ -328,7 +328,7 @@ def test_a_bad_file_is_refused_in_one_line(made, name, value, tmp_path):
 
 
 def test_wedges_meet_tetrahedra_and_hexahedra_face_to_face():
-    """Three unit cubes in an L: on a wedge's triangles stand tetrahedra, beside its quadrilaterals a hexahedron."""
+    """Three unit cubes in an L: tetrahedra on a wedge's triangles, and a hexahedron next to its quadrilaterals."""
     wedges, tops, cube = (box_mesh(k, (1,) * 3, low, np.add(low, 1)) for k, low in (
         ("wedge", (0, 0, 0)), ("tetra", (0, 0, 1)), ("hexahedron", (1, 0, 0))))  # fmt: skip
     x, at = np.unique(np.concatenate([m.points for m in (wedges, tops, cube)]), axis=0, return_inverse=True)

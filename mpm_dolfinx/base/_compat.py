@@ -58,7 +58,7 @@ def box_mesh(
         return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
     domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
     lists = graph.adjacencylist(*where)
-    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap those of a partitioner
+    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap a partitioner's
     return mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=lambda *_: lists)
 
 

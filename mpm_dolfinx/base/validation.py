@@ -293,7 +293,7 @@ def given(
     again = max(dim, 1) // m + 1  # repetitions that make m exceed the number of components
     repeated = {name: np.tile(x, (again, 1)) for name, x in places.items()}
     many = [*[(m * again,)] * number, *[(m * again, dim)] * bool(dim)]
-    allowed = f"{allowed}, or as much for each of {m * again} places"
+    allowed = f"{allowed}, or one of these for each of {m * again} places"
     out = numbers(what, asked(what, allowed, called, value, {"t": t, **repeated}), *one, *many, allowed=allowed)
     if out.shape == (dim,):
         return np.broadcast_to(out, (m, dim))

@@ -247,7 +247,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
             at = np.minimum(np.searchsorted(known, rows), max(0, len(known) - 1))
             missing = rows[known[at] != rows] if len(known) else rows
             if missing.size:
-                raise ValueError(f"*ELEMENT: node {missing.flat[0]} is not there, must be one of *NODE")
+                raise ValueError(f"*ELEMENT: node {missing.flat[0]} is undefined, must be one of *NODE")
             cells.append((kind, start + where[at]))
             numbers.append((k, number))
         _once([number for of, number in numbers if of == k], "element")
@@ -273,7 +273,7 @@ def _once(
         same &= (np.diff(x[order], axis=0) != 0).any(axis=1)
     same = np.flatnonzero(same)
     if len(same):
-        raise ValueError(f"{what} {numbers[order][same[0]]} is there twice in one part, must be there once")
+        raise ValueError(f"{what} {numbers[order][same[0]]} occurs twice in one part, must occur once")
     return numbers[order], order
 
 

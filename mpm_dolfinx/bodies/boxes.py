@@ -180,7 +180,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; they need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, rows of points end at
-        grid lines.  A value of 1 makes thin bodies too flexible (with a warning), and errors ten times those of 2.
+        grid lines.  A value of 1 makes thin bodies too flexible (with a warning), and errors ten times as large as 2.
     material
         Index of the material in the scene's list, >= 0.
 
@@ -243,7 +243,7 @@ def shape(
     if filled.shape != (len(index),) or filled.dtype != bool:  # such as a signed distance
         raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     if not filled.any():
-        raise ValueError("body: inside(x) is False at all points, must be True at one; the body may be below a cell")
+        raise ValueError("body: inside(x) is False at all points, must be True at one: is it below a cell in size?")
     numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
     if not grid.even:
         return check_inside(grid, _lattice(rows, filled=numbers_of, material=material))

@@ -84,7 +84,7 @@ def put(
     bodies, there, fill
         All bodies, indices of the present ones, and index of the fill.
     points, new
-        Points of the present bodies on this process, and those of the seeded fill.
+        Points of the present bodies, and of the seeded fill, on this process.
 
     Raises
     ------

@@ -50,7 +50,7 @@ def from_mesh(
 
     Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
     surfaces, or facet tags.  Bodies from several parts of a mesh share their inner faces, which are no surface while
-    both are present.  Reference positions are those of the mesh.  The points form no lattice, so the filter of short
+    both are present.  The mesh has reference positions.  The points form no lattice, so the filter of short
     waves does not act.
 
     Parameters
@@ -76,8 +76,8 @@ def from_mesh(
     Raises
     ------
     ValueError
-        A missing or unreadable file, another kind of mesh, an unknown part, flat, inverted, non-convex, repeated or
-        overlapping cells, vertices outside the grid, hanging or duplicate nodes.
+        A missing or unreadable file; another kind of mesh; an unknown part.  Cells that are flat, inverted, non-convex,
+        repeated or overlapping; vertices outside the grid; hanging or duplicate nodes.
     """
     instance("body: grid", grid, Grid)
     name, names = "mesh", _numbers(names)
@@ -87,7 +87,7 @@ def from_mesh(
     if isinstance(mesh, meshio.Mesh):
         if not (cell_tags is None or isinstance(cell_tags, str)) or facet_tags is not None:
             raise ValueError(
-                "mesh: cell_tags and facet_tags must be of a dolfinx mesh; or cell_tags a name of cells' data"
+                "mesh: cell_tags and facet_tags must be tags of a dolfinx mesh, or cell_tags the name of cell data"
             )
         found = _of_meshio(grid, mesh, names, cell_tags, name)
     else:

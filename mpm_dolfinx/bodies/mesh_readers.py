@@ -56,7 +56,7 @@ def check_systems(mesh: meshio.Mesh) -> None:
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return cell sets by name, numbered within blocks; meshio numbers those of FLAC3D across all blocks."""
+    """Return cell sets by name, numbered within blocks; meshio numbers FLAC3D sets across all blocks."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

@@ -203,8 +203,8 @@ def _check_once(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -
         count = np.bincount(same)
         if (count > 1).any():
             x = mesh.x[nodes[first[count > 1][0]]].mean(axis=0)
-            what = f"{np.count_nonzero(count > 1)} cells ({kind}) are there more than once, the first at {x}"
-            raise ValueError(f"{name}: {what}, must be there once")
+            what = f"{np.count_nonzero(count > 1)} cells ({kind}) occur more than once, the first at {x}"
+            raise ValueError(f"{name}: {what}, must occur once")
 
 
 def _check_sides(
@@ -373,8 +373,8 @@ def _check_conforming(body: MeshBody, name: str) -> None:
     cover = covers(own, own)
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
-        what = f"{len(np.unique(cover.face))} faces lie on others without sharing their nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged, or be of two parts")
+        what = f"{len(np.unique(cover.face))} faces touch others without common nodes, the first at {x}"
+        raise ValueError(f"{name}: {what}: hanging or duplicate nodes, must be merged, or belong to two parts")
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:

@@ -110,7 +110,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
     for k, hole in enumerate(outlines[1:], start=1):
         within = [_inside(hole[0], outline) for m, outline in enumerate(outlines) if m != k]
         if not within[0] or any(within[1:]):
-            raise ValueError(f"polygon: the hole at {hole[0]} must be inside of the polygon, and of no other hole")
+            raise ValueError(f"polygon: the hole at {hole[0]} must be inside the polygon, and outside other holes")
 
 
 def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -238,7 +238,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), N, of forces in the local cells, given those without this condition."""
+        """Return rounding errors (cells,), N, of forces in the local cells, given the errors without it."""
         return of_cells
 
     @property
@@ -278,7 +278,7 @@ class Loads:
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points after a step, given those before it, lie in forbidden regions."""
+        """Raise an error if points lie in forbidden regions after a step; before: points at its start."""
 
 
 class Acting:

@@ -6,14 +6,14 @@ before any map.  Meshes have their own names (`from_mesh`).  A side moves with i
 body at seeding are not part of it.  Regions and X are reference positions, before all maps (`mapped`); reference areas
 refer to the seeded shape, after the maps.
 
-A new kind of condition is a class of this form in its own file, with a method `acting` for loads on the momentum, see
-`conditions/acting.py`, or `feeding` for the fluid, see `flow/feeding.py`.
+A new kind of condition is a class of this form in its own file.  It has a method `acting` for loads on the momentum
+(`conditions/acting.py`), or `feeding` for the fluid (`flow/feeding.py`).
 
 Values may be functions of time t, reference positions X and present positions x, called by these parameter names; see
 `validation`.
 
-An invalid condition raises a ValueError when it, a scene or a stage is made, invalid values of a function in the step
-that needs them.  A condition equals only itself, because values and regions may be arrays or functions.
+An invalid condition raises a ValueError when it, a scene or a stage is made.  Invalid values of a function do so in the
+step that needs them.  A condition equals only itself, because values and regions may be arrays or functions.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ class Source:
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return the user's terms of the momentum balance, and those of the fluid storage."""
+    """Return the user's terms of the momentum balance, and the terms of the fluid storage."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -388,8 +388,8 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, Pa, of the penalty for prescribed displacements.
 
     A Q1 field of constant cell volumes cannot follow a curved side.  The penalty turns the difference into pressure, so
-    it must not be stiff relative to the shear stiffness.  The pressure in an undrained cavity in soil is up to 1.9
-    times the exact one with 3e2 (lambda + 2G), and 1.01 times with 30 times 4G.
+    it must not be stiff relative to the shear stiffness.  In an undrained cavity in soil, 3e2 (lambda + 2G)
+    gives up to 1.9 times the exact pressure, and 30 times 4G gives 1.01 times.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -410,8 +410,8 @@ class Displacement(Condition):
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the condition.  If it ends within a side, a cell that it covers by at
-        most one half is free, because the last prescribed node carries half a cell beyond it.
+        Box of reference positions that limits the condition.  The last prescribed node carries half a cell beyond it.
+        If the box ends within a side, a cell that it covers by at most one half is therefore free.
 
     Raises
     ------

@@ -14,10 +14,10 @@ the points after the previous step,
 
 with the projection P on the tangent plane.  Sticking contact is elastic with stiffness k_t.
 
-The slipping set is updated after Newton steps (active set).  All cells start in stick, at any traction.  A cell whose
-slip reverses returns to stick near equilibrium, and then stays.  An update in each residual would make cells chatter,
-because slip has no stiffness.  A sticking cell that opens slips afterwards, the second time for good: under a round
-tool at first contact the mean normal is inclined, and shear alone would open and close the contact.
+The slipping set is updated after Newton steps (active set).  Updates in each residual would make cells chatter, because
+slip has no stiffness.  All cells start in stick, at any traction.  A cell with reversed slip returns to stick, and may
+then slip again, only near equilibrium.  A sticking cell that opens slips afterwards, the second time for good.  Under a
+round tool at first contact the mean normal is inclined, and shear alone would open and close the contact.
 """
 
 from __future__ import annotations

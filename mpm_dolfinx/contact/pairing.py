@@ -304,7 +304,7 @@ class Contacts:
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
         """Raise an error if groups overlap at the start of a stage at time t (s)."""
         if message := self._too_deep(cut, points):
-            raise ValueError(f"{message}, at t = {t:g} s as it begins, must touch or be apart")
+            raise ValueError(f"{message}, at the start t = {t:g} s, must touch or be apart")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
         """Return a message with the depth and place of an overlap of groups, "" if there is none."""

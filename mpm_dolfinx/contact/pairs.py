@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Possible contact pairs: quadrature points on a surface, each with a place on a tool or another group.
 
-The relative displacement of a pair is w = B u.  B has the nodes of the point's cell and, for groups, those of the
+The relative displacement of a pair is w = B u.  B has the nodes of the point's cell and, for groups, of the
 other side.  A place on a tool moves with the tool.
 """
 
@@ -89,7 +89,7 @@ class Pairs:
 class ToolPairs(Pairs):
     """Points on faces that face tools.
 
-    tools, poses (contacts,): tools, and their poses at the end of the substep without its displacement by loads; now,
+    tools, poses (contacts,): tools, and their poses, with displacements by loads up to the start of the step; now,
     carried (m, d): position of the point at the start of the step, and its image under the motion of the tool, m.
     Shears are rotated with the tool.
     """

@@ -2,9 +2,9 @@
 """Contact problem of a substep, with tools or between groups of bodies.
 
 With the relative displacements w = B u of the pairs, nodal forces are B^T f(w).  Forces on both bodies are therefore
-equal and opposite within rounding.  For two deformable sides, pairs, normals and gaps are those at the start of the
-step at first.  After convergence they are updated at the new positions, and the step is solved again, until the gaps
-are those of the faces at the end of the step.
+equal and opposite within rounding.  For two deformable sides, pairs, normals and gaps are at first taken from the
+start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This ends
+when the gaps match the faces at the end of the step.
 
 The displacement a of a load-controlled tool along its direction e is one more unknown.  Let f(w - a e) be the forces on
 points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with the
@@ -429,7 +429,7 @@ class ContactProblem(Loads):
         return self.pairs.cell[rows], None if other is None else other[0][rows], self.pairs.x[rows], along
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors, with those of gaps by large coordinates."""
+        """Return the rounding errors, which include gaps between large coordinates."""
         if self.pairs.other_side() is not None:
             return of_cells
         out, cells = of_cells.copy(), self.pairs.cell

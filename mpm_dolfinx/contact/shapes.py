@@ -142,7 +142,7 @@ class Ball:
 class Convex:
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
-    The distance is the largest of those to its planes.  It is exact inside; outside, next to edges and corners, it is
+    The distance is the largest one to its planes.  It is exact inside; outside, next to edges and corners, it is
     too small, but there is no contact there.
 
     Parameters

@@ -58,8 +58,8 @@ class Tool:
         Additional shear strength of the contact, Pa, >= 0: alpha s_u for undrained soil, with friction 0.  It is
         limited to ten times the normal pressure.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
-        Moves the tool along `direction`, beyond its displacement, until the reaction of the bodies is equal to the
-        load. It acts from the first step.  The tool must begin in contact, or less than a cell away.  `tool_travel` of
+        The tool moves along `direction`, beyond its displacement, until the reaction equals the load, from the first
+        step on.  The tool must begin in contact, or less than a cell away.  `tool_travel` of
         the simulation is this additional displacement.  In axisymmetry the load of the whole revolution.
     direction : (d,)
         Direction of the load; of any length; in axisymmetry along the axis.

@@ -256,7 +256,7 @@ class Tools:
             met = points.data[pressure_name(self.names[number])] > 0
             deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
             if deep > BEGINS:
-                what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"
+                what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
     def check_end(

@@ -151,7 +151,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
                 if n > 1:
                     much = f"it bends {1 / (n**2 - 1):.0%} too much"
                 if n > 1 and wet:
-                    much = f"with pore fluid it bends some {LOST_WET / n**2:.0%} too much and creeps"
+                    much = f"with pore fluid it bends about {LOST_WET / n**2:.0%} too much and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
                 warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, h, much)
 

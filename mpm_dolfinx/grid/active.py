@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The active part of a grid: a step touches nothing else, however large the box is."""
+"""Active part of a grid: a step only touches cells with material, for any size of the box."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ class ActiveSet(NamedTuple):
 
 
 class Active:
-    """The cells that hold something since the grid was reset, and their nodes.
+    """The cells with material since the last grid reset, and their nodes.
 
     Parameters
     ----------
     grid
         Background grid.
     wet
-        Whether cells may hold fluid.
+        Whether cells may contain fluid.
     cells, dofs
-        Local arrays by cells, and by unrolled degrees of freedom, that are zero where nothing is.
+        Local arrays by cells, and by unrolled degrees of freedom, that are zero outside the active part.
 
     Attributes
     ----------
     slot : (cells,)
-        Places of cells among the owned active ones.
+        Index of each cell among the owned active ones.
     centroid, opening : (cells, d), (cells, d, 2)
-        Centroids of the contents of cells from their midpoints, m, and open shares of their faces.  Empty without
-        fluid, as is `slot`.
+        Offsets of the centroids of the contents from the midpoints, m, and open fractions of faces.  Empty without
+        fluid, like `slot`.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):
@@ -66,7 +66,7 @@ class Active:
         return self._now.dofs
 
     def clear(self) -> None:
-        """Empty the arrays, before other cells become active."""
+        """Reset the arrays to zero, before other cells become active."""
         for rows, arrays in ((self.cells, self._of_cells), (self.dofs, self._of_dofs)):
             for values in arrays:
                 values[rows] = 0.0

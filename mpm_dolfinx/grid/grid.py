@@ -41,7 +41,7 @@ MOST = 2**31 - 1
 SNAP = 1e-10
 """Cells: distance to a grid plane below which a vertex lies on it, if rounding is smaller; below any visible effect."""
 ORDER = "the order is Grid(lower, upper, cells)"
-MANY = "grid: h of unequal cells: must be asked of each cell, see sizes"
+MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
