@@ -4,11 +4,11 @@
 The gradient of a domain is a mean.  In bending the gradient varies across the domain.  With one value per domain the
 bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a piece of the domain
 
-    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the pieces),
+    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the volume at rest),
 
-with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of neighbours of
-the same material across faces.  e is then corrected so that the mean of det F is that of the domain.  Linear fields are
-reproduced on any mesh, and uniform fields stay uniform.
+with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of the
+neighbours across faces that have the same material.  e is then corrected so that the pieces have the domain's volume at
+rest, int dV / det F.  Linear fields are reproduced on any mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations
@@ -146,28 +146,30 @@ def within(
         Equal rows mark points of the same material.
     """
     # arrays have points or pieces last: rows of a few numbers each would take numpy several times as long
-    of, d, k = cut.pieces.point, cut.grid.dim, F.shape[1]
+    of, d, k, fraction = cut.pieces.point, cut.grid.dim, F.shape[1], cut.pieces.fraction
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
     slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, alike)
-    apart = [x - sum_by(of, cut.pieces.fraction * x, len(F))[of] for x in cut.pieces.x.T]
+    apart = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
     xi = [sum(inverse[a, b][of] * x for b, x in enumerate(apart)) for a in range(d)]
     J, back = determinant(F), np.moveaxis(cofactor(F), 0, 2).swapaxes(0, 1)
     e = np.einsum("ijn,ajkn->aikn", back / J, slope)
-    # their part of second order would change the mean of det F, and isotropic scaling differs in the plane and in space
-    second = np.zeros((k, k, len(F)))
+    ratio = np.trace(e, axis1=1, axis2=2)
+    # about the mean by volumes at rest; and without the part of second order, which would change the domain's volume
+    shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
     for a, b in np.ndindex(d, d):
-        spread = sum_by(of, cut.pieces.fraction * xi[a] * xi[b], len(F))
-        second += 0.5 * spread * (np.trace(e[b]) * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
-    middle_F = np.moveaxis(F, 0, 2)
-    middle_F = middle_F - np.einsum("ijn,jkn->ikn", middle_F, second)
-    out = middle_F[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
+        spread = sum_by(of, fraction * xi[a] * xi[b], len(F))
+        shift += spread * ratio[b] * slope[a]
+        second += 0.5 * spread * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
+    base = np.moveaxis(F, 0, 2)
+    base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
+    out = base[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
     out = np.ascontiguousarray(np.moveaxis(out, 2, 0))
     here = determinant(out)
     if (inverted := here <= 0).any():  # their domains keep one gradient
         even = np.isin(of, of[inverted])
         out[even] = F[of[even]]
         here[even] = J[of[even]]
-    return out * (J / sum_by(of, cut.pieces.fraction * here, len(F)))[of, None, None] ** (1 / k)
+    return out * (J * sum_by(of, fraction / here, len(F)))[of, None, None] ** (1 / k)
 
 
 def _slopes(
