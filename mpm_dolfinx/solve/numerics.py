@@ -31,7 +31,7 @@ class Numerics:
         Of time integration: "sdirk2", of second order, or "backward-euler".
     renewal
         Whether domains of yielded soil that have become longer than a cell are renewed, see `stepping/renewal.py`:
-        of dry soil in plane strain, on equal cells, without inertia and groups, with `quadrature="domain"`.
+        of dry or saturated soil in plane strain, on equal cells, without inertia and groups, with `quadrature="domain"`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.
 
