@@ -23,7 +23,7 @@ APART = 0.01
 Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
 """
 CRUMB = NEAR
-"""Share of a cell that is no domain of its own: what is left of one beside it has its mass.  Source: as `NEAR`."""
+"""Area, in cells, below which a part of a domain is dropped; its mass goes to the other parts.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
 """Share of a cell: where less is left of a domain, its cell is filled anew as well.
 

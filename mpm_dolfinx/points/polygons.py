@@ -63,7 +63,7 @@ class Polygons:
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
         """Return the part of each polygon with normal . x <= level; normal (n, 2), level (n,).
 
-        By Sutherland and Hodgman (1974).  A new edge has no number; give the level some room for what lies on it.
+        The algorithm is that of Sutherland and Hodgman (1974). A new edge has no number.
         """
         n, k = self.edge.shape
         here = np.arange(k) < self.count[:, None]
@@ -80,9 +80,9 @@ class Polygons:
         return _packed(x, edge, kept)
 
     def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
-        """Return what of each polygon lies in another one, convex and anti-clockwise, with vertices (n, m, 2).
+        """Return the intersection of each polygon with a convex, anti-clockwise one with vertices (n, m, 2).
 
-        near, m: what lies beyond by less stays.
+        near: tolerance, m, within which vertices outside count as inside.
         """
         out = self
         for k in range(others.shape[1]):
@@ -99,16 +99,17 @@ class Polygons:
         return _packed(self.x, self.edge, here & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Return convex polygons as quadrilaterals, by diagonals that leave the most on their smaller side.
+        """Divide convex polygons into quadrilaterals, by diagonals with the largest smaller part.
 
         So no vertex and no direction is preferred.
 
         Returns
         -------
-        The polygon (m,) each is of; its vertices (m, 4, 2), of a triangle also the middle of its longest edge; numbers
+        The polygon (m,) of each; its vertices (m, 4, 2), of a triangle with the middle of the longest edge; numbers
         (m, 4) of its edges.
         """
-        left, rows, found = self, np.arange(len(self.count)), []
+        left, rows = self, np.arange(len(self.count))
+        found = []
         while len(rows):
             most = int(left.count.max())
             at = left.count == most
@@ -126,7 +127,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Return of polygons of the same n > 4 vertices a quadrilateral each, of five a triangle, and what is left."""
+        """Cut a quadrilateral off polygons with the same n > 4 vertices, or a triangle off pentagons; return both."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None

@@ -105,7 +105,7 @@ def resampled(
 ) -> NDArray[np.float64]:
     """Return vertices (n, EDGES + 1, 2) of surfaces from P to Q (n, 2), evenly along their parts.
 
-    Their area beyond the chords stays what it is: vertices are shifted by what they would lose.
+    The area between surface and chord is preserved: vertices shift by the lost area.
 
     of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
     """

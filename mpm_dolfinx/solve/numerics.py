@@ -30,8 +30,9 @@ class Numerics:
     method
         Time integration: "sdirk2", of second order, or "backward-euler".
     renewal
-        Whether domains of yielded soil that have become longer than a cell are renewed, see `stepping/renewal.py`:
-        of dry or saturated soil in plane strain, on equal cells, without inertia and groups, with `quadrature="domain"`.
+        Whether to renew particle domains of yielded soil that have become longer than a cell, see
+        `stepping/renewal.py`. It needs dry or saturated soil in plane strain, equal cells, no inertia, no groups, and
+        `quadrature="domain"`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.
 

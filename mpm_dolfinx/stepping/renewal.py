@@ -9,11 +9,10 @@ filled anew:
 * a cell that the surface crosses once with quadrilaterals about the centroid of the filled part. The surface there
   becomes `EDGES` edges, with the same ends, area and sharp corners.
 
-What old domains have beyond these cells is cut off, and stays as it is.  Masses, volumes, the mass of the fluid, and
-sums by mass of what else points carry are exact in each cell, the logarithm of the elastic left Cauchy-Green tensor
-among them: means over the overlap, put to the new centroids by slopes fitted in each cell, within the values there.
-Cells that hold elastic soil, several bodies, sides with given displacements, or more than one pass of the surface are
-left alone.
+The parts of old domains outside these cells are cut off and kept. Masses, volumes and the mass of the fluid are exact
+in each cell. So are sums by mass of other data of points, the logarithm of the elastic left Cauchy-Green tensor among
+them: means over the overlap, shifted to the new centroids by fitted slopes, within the range of values. Cells with
+elastic soil, several bodies, prescribed displacements, or several crossings of the surface are left alone.
 """
 
 from __future__ import annotations
@@ -98,16 +97,16 @@ class Renewal:
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return which points (n,) may be renewed: not those that probes are in, nor those that the grid still has."""
+        """Return the points (n,) that may be renewed: without probes, and not in a part of the bodies that rests."""
         free = self.flowed(state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps
 
     def renewed(self, state: State) -> tuple[State, int]:
-        """Return a state some of whose domains are renewed, and how many were; of all processes together.
+        """Return the state with renewed domains, and the number of replaced ones. The call is collective.
 
-        Where any should be, the first process has all points afterwards.  NotConverged, on all, where it fails.
+        After a renewal the first process has all points. A failure raises NotConverged on all processes.
         """
         comm = self._grid.comm
         free = self._free(state)
@@ -121,7 +120,7 @@ class Renewal:
         try:
             if comm.rank == 0:
                 made, count = self._renewed(state, free)
-        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # other processes would wait
+        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised on all below
             message = str(error)
         if message := first(comm, message):
             raise NotConverged(f"renewal of domains: {message}")
@@ -160,9 +159,9 @@ class Renewal:
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, of new domains that bring their cells what the old ones did.
+        """Return the pressures (m,), Pa, of new domains, which give their cells the fluid of the old ones.
 
-        group (m,): that of each new domain.  By what is stored, or by volume in a cell that stores nothing.
+        They are means in each group, (m,) of the new domains: by storage, or by volume if nothing is stored.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk

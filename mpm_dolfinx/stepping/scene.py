@@ -150,7 +150,7 @@ class Scene:
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
         self._renewed: Latest[tuple[dict[str, Any], int]] = Latest()
-        _ = self._renewal  # refuses scenes that have none
+        _ = self._renewal  # refuses scenes without support for it
 
     @property
     def flows(self) -> bool:
