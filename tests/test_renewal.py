@@ -248,15 +248,19 @@ def test_wet_clay_flows_around_a_bar(rate, cells=4, depth=1.0):
     assert (N[1:] / N[:-1])[24:].min() > 0.9
 
 
-@pytest.mark.parametrize("processes", [1, 3])
-def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(processes, tmp_path):
+@pytest.mark.parametrize(
+    ("processes", "wet"),
+    [(1, False), (3, True), *(pytest.param(2, wet, marks=pytest.mark.slow) for wet in (False, True))],
+)
+def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(processes, wet, tmp_path):
     """On one process to the bit."""
-    mpirun(processes, "mpi_renewal.py", str(tmp_path / "whole"))
-    mpirun(1, "mpi_renewal.py", str(tmp_path / "parts"), "restart")
+    kind = ["wet"] * wet
+    mpirun(processes, "mpi_renewal.py", str(tmp_path / "whole"), *kind)
+    mpirun(1, "mpi_renewal.py", str(tmp_path / "parts"), "restart", *kind)
     one, other = (np.load(tmp_path / f"{name}.npz") for name in ("whole", "parts"))
     assert one["renewed"] == other["renewed"] > 0
     assert np.array_equal(one["id"], other["id"])
-    for name in ("x", "volume0", "plastic", "force", "shear"):
+    for name in ("x", "volume0", "pressure", "plastic", "force", "shear"):
         size = np.abs(other[name]).max()
         assert one[name] == pytest.approx(other[name], abs=(0 if processes == 1 else 1e-7) * size)
 
