@@ -25,7 +25,7 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--out", type=Path, default=Path("out/tutorial"), help="folder for the picture")
-out = parser.parse_args().out
+out = parser.parse_known_args()[0].out  # a notebook has options of its own
 
 # 1. A domain, cut by the grid.
 #

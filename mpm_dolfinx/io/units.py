@@ -14,6 +14,7 @@ FIELDS = {
         "mean_effective_stress": "Pa, p' = -(xx + yy + zz) / 3, positive in compression",
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
         "porosity": "-, present volume fraction of the pores",
+        "saturation": "-, share of the pores that is full of water, of soil that drains under suction",
         "owed, due": "-, volume that the fluid has yet to fill, over that at rest; what of it the next step takes in",
         "softness": "-, elastic over present shear stiffness where a law yields, 1 to 100",
         "tool_pressure, tool_shear": "Pa, pressure and shear traction of the tool `tool` on the surface of the domain",
