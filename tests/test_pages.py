@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The reference has all public names, its pages are there, and scripts become notebooks."""
 
+import contextlib
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -38,6 +40,24 @@ def test_pages_of_the_menu_are_laid_with_the_files_that_they_link_to(tmp_path):
         for link in links:
             assert link.startswith("http") or (tmp_path / name).parent.joinpath(link).exists(), (name, link)
     assert (tmp_path / "tutorial.md").read_text().count("\n## ") == 6
+
+
+def test_names_beside_words_of_other_programs_are_there():
+    section = (ROOT / "demos/README.md").read_text().partition("## Words of other programs\n")[2].partition("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ")][1:]
+    code = [each for row in rows for each in re.findall(r"`([^`]+)`", row)]
+    parameters = set()
+    for name in mpm.__all__:
+        if callable(value := getattr(mpm, name)):
+            with contextlib.suppress(ValueError):
+                parameters |= {*inspect.signature(value).parameters}
+    parameters |= {*inspect.signature(mpm.Simulation.run).parameters, *inspect.signature(mpm.Simulation.stage).parameters}
+    assert len(rows) > 25 and len(code) > 50
+    for each in code:
+        found = [hasattr(mpm, name) for name in re.findall(r"\bmpm\.(\w+)", each)]
+        found += [hasattr(mpm.Simulation, name) for name in re.findall(r"\bsimulation\.(\w+)", each)]
+        found += [name in parameters for name in re.findall(r"\b(\w+)=", each)]
+        assert found and all(found), each
 
 
 def test_scripts_become_notebooks_with_text_and_code(tmp_path):

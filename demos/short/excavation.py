@@ -28,4 +28,4 @@ for lift in range(3):
     simulation.stage(remove=[lift], conditions=[far, sheet_pile, bottom])
     simulation.run(t_end=simulation.t + DAY, dt=DAY / 4)
 print(f"water to be pumped: {DAY * simulation.outflows['pit']:.2f} m^3 a day and metre of the half pit")
-mpm.plot(simulation, "pressure").figure.savefig("excavation.png", bbox_inches="tight")
+mpm.plot(simulation, "pressure").figure.savefig("excavation.png", dpi=80, bbox_inches="tight")

@@ -15,7 +15,7 @@ simulation = mpm.Simulation(
     walls={"left": "x", "right": "x", "bottom": "xy"},
     conditions=[footing],
 )
-simulation.run(t_end=1, dt=0.05)
+simulation.run(t_end=1, dt=0.1)
 load = -2 * simulation.reactions["footing"][1]  # N/m, of both halves
 print(f"bearing capacity: {load / (WIDTH * STRENGTH):.2f} of the strength (Prandtl: 5.14)")
 mpm.plot(simulation, "displacement").figure.savefig("footing.png", bbox_inches="tight")

@@ -17,9 +17,8 @@ simulation = mpm.Simulation(
     conditions=[*mpm.water("left", 8.0), *mpm.water("right", 2.0)],
     gravity=(0, -9.81),
     pressure=mpm.hydrostatic(5),
-    initial_stress=mpm.K0(0.5),
 )
-simulation.run(t_end=1e8, dt=1e7)
+simulation.run(t_end=1e8, dt=2e7)
 flow = simulation.outflows["drained_right"]
 print(f"flow: {flow * 86400:.4f} m^3 a day and metre of the dam")
 mpm.plot(simulation, "pressure").figure.savefig("seepage.png", bbox_inches="tight")

@@ -34,5 +34,5 @@ simulation = mpm.Simulation(
 before = mpm.factor_of_safety(simulation, dt=1.0, rtol=0.02).factor
 simulation.run(t_end=24 * HOUR, dt=4 * HOUR)
 after = mpm.factor_of_safety(simulation, dt=1.0, rtol=0.02).factor
-print(f"factor of safety: {before:.2f}, after a day of rain {after:.2f}")
+print(f"factor of safety: {after:.2f} after a day of rain, {before:.2f} before")
 mpm.plot(simulation, "saturation").figure.savefig("slope_in_rain.png", bbox_inches="tight")

@@ -24,4 +24,4 @@ simulation = mpm.Simulation(
 simulation.run(t_end=1, dt=0.1)
 force = -2 * simulation.tool_forces["bar"][1]  # N/m
 print(f"resistance: {force / (2 * RADIUS * STRENGTH):.2f} of the strength (Randolph and Houlsby: 11.94)")
-mpm.plot(simulation, "displacement").figure.savefig("t_bar.png", bbox_inches="tight")
+mpm.plot(simulation, "displacement").figure.savefig("t_bar.png", dpi=80, bbox_inches="tight")
