@@ -202,7 +202,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
-    "damping of what yields": (lambda n: sealed_soil(n, yields=False), sealed_soil),
+    "damping of yielded soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
     "mean dilatation": (
         lambda n: block(n, soil(nu=LOCKING - 1e-3)),
         lambda n: block(n, soil(nu=LOCKING + 1e-3)),
@@ -211,15 +211,15 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         block,
         partial(plastic, law=mpm.DruckerPrager),
     ),
-    "Mohr-Coulomb beside Drucker-Prager": (
+    "Mohr-Coulomb instead of Drucker-Prager": (
         partial(plastic, law=mpm.DruckerPrager),
         partial(plastic, law=mpm.MohrCoulomb),
     ),
-    "softening beside Drucker-Prager": (
+    "softening instead of Drucker-Prager": (
         partial(plastic, law=mpm.DruckerPrager),
         partial(plastic, law=mpm.SofteningDruckerPrager, residual=1e8, slip=1e3, viscosity=1.0),
     ),
-    "Modified Cam Clay beside Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
+    "Modified Cam Clay instead of Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),

@@ -32,7 +32,11 @@ def docstrings(paths: list[Path]) -> list[str]:
         for node in ast.walk(ast.parse(path.read_text())):
             body = getattr(node, "body", None)
             for child in body if isinstance(body, list) else ():
-                if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant) and type(child.value.value) is str:
+                if (
+                    isinstance(child, ast.Expr)
+                    and isinstance(child.value, ast.Constant)
+                    and type(child.value.value) is str
+                ):
                     out += paragraphs(child.value.value)
     return out
 

@@ -51,7 +51,10 @@ def test_names_beside_words_of_other_programs_are_there():
         if callable(value := getattr(mpm, name)):
             with contextlib.suppress(ValueError):
                 parameters |= {*inspect.signature(value).parameters}
-    parameters |= {*inspect.signature(mpm.Simulation.run).parameters, *inspect.signature(mpm.Simulation.stage).parameters}
+    parameters |= {
+        *inspect.signature(mpm.Simulation.run).parameters,
+        *inspect.signature(mpm.Simulation.stage).parameters,
+    }
     assert len(rows) > 25 and len(code) > 50
     for each in code:
         found = [hasattr(mpm, name) for name in re.findall(r"\bmpm\.(\w+)", each)]

@@ -25,5 +25,7 @@ def test_vague_words_and_long_sentences_are_counted():
     long = " ".join(["word"] * 26)
     texts = prose.paragraphs(f"What stands beside `those` names: three.\n\n* {long}. Of which\n* a short one.")
     found = prose.measures(texts)
-    assert found["words"] == 37 and found["vague"] == pytest.approx(3000 / 37) and found["long"] == pytest.approx(100 / 3)
+    assert (
+        found["words"] == 37 and found["vague"] == pytest.approx(3000 / 37) and found["long"] == pytest.approx(100 / 3)
+    )
     assert len(prose.poor(texts)) == 4
