@@ -131,7 +131,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
     parser.add_argument("--steps", type=int, default=60, help="steps in which the cohesion is lost")

@@ -50,7 +50,7 @@ def errors(result: mpm.Result) -> list[float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the benchmark; return what --json prints."""
+    """Run the benchmark; return the results of --json."""
     parser = common.Parser(__doc__, __file__, writes=False)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--t-end", type=float, default=1.2, help="end time, s")

@@ -299,7 +299,7 @@ def line(name: str, row: dict) -> str:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")

@@ -93,7 +93,7 @@ def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--cells", type=int, default=4, help="cells over the height")

@@ -176,7 +176,7 @@ def push(OCR: float, cells: int) -> Undrained:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius")
     parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained ones")

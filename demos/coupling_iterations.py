@@ -209,7 +209,7 @@ def undrained(h: float, law: type[mpm.Hencky]) -> tuple[mpm.Simulation, mpm.Resu
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, nargs="+", default=[0.06, 0.03, 0.015], help="cell sizes, m")
     parser.add_argument("--quick", action="store_true", help="coarser: every other k dt, hard water only")

@@ -106,7 +106,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")

@@ -187,7 +187,7 @@ def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
         "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; standard MPM: the last"

@@ -294,7 +294,7 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="cases to run")
     parser.add_argument("--quick", action="store_true", help="a few coarse runs of each case")

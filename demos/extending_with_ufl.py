@@ -362,7 +362,7 @@ EXAMPLES = (energy, fibres, kozeny_carman, strain_law, springs, well, damage, pl
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height, a multiple of 4")
     o = parser.parse_args(argv)

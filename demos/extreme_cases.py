@@ -202,7 +202,7 @@ def draw(out: Path, rows: list[Row]) -> None:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="four cases of each family, the first and last among them")

@@ -65,7 +65,7 @@ def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Res
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=5, help="cells over a ball's radius")
     parser.add_argument("--dt", type=float, default=0.005, help="step, s")

@@ -229,7 +229,7 @@ def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, gra
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
     parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")

@@ -136,7 +136,7 @@ def run(tissue: Tissue, rtol: float) -> Outcome:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--pixels", type=int, default=48, help="over the edge of the picture")
     parser.add_argument("--seed", type=int, default=9, help="of the picture")

@@ -113,7 +113,7 @@ def pressed(cells: int, wet: bool) -> Pressed:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact")
     o = parser.parse_args(argv)

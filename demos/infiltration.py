@@ -87,7 +87,7 @@ def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--rain-step", type=float, default=600.0, help="step under rain, s")

@@ -56,7 +56,7 @@ def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--dt", type=float, default=0.05, help="step of the slide, s")

@@ -123,7 +123,7 @@ def output_times(o: Namespace) -> dict:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     o = arguments(argv)
     try:
         simulation, bottom = scene(o)

@@ -41,7 +41,7 @@ def options(h: float, steps: int, quadrature: str = "domain") -> Namespace:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--steps", type=int, nargs="+", default=[10, 20, 40, 80, 160], help="numbers of load steps")

@@ -80,7 +80,7 @@ def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells across the slope")
     parser.add_argument("--step", type=float, default=1800.0, help="step in the first two days, s")

@@ -92,7 +92,7 @@ def tilted(name: str, delta: float, cells: int) -> Tilted:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the height of the wall")
     parser.add_argument("--delta", nargs="*", type=float, default=[0, 15], help="friction angles of the wall, degrees")

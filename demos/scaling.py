@@ -287,7 +287,7 @@ def write(out: Path, rows: list[dict]) -> dict:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--dims", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="dimensions")

@@ -68,7 +68,7 @@ def exact(f: np.ndarray) -> np.ndarray:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the layer, even")
     parser.add_argument("--steps", type=int, default=500, help="steps of the run")

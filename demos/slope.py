@@ -69,7 +69,7 @@ def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--steps", type=int, default=40, help="steps of the slide")

@@ -238,7 +238,7 @@ def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost")

@@ -116,7 +116,7 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=25, help="cells over the height of the column")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="to T_v = 0.1")

@@ -88,7 +88,7 @@ def costs(cells: int, steps: int = 30) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--steps", type=int, default=100, help="steps of a test")
     parser.add_argument("--cost", type=int, metavar="N", help="also print what a step costs, N x N cells")

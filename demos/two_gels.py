@@ -82,7 +82,7 @@ def hertz(cells: int) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel")
     parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies")

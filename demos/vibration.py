@@ -85,7 +85,7 @@ def own_loss(t: np.ndarray, steps: int) -> np.ndarray:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
         "--h", type=float, nargs="+", default=[0.1, 0.05], help="cells of the beam, m; 0.3 / h is whole"

@@ -111,7 +111,7 @@ def levee(h: float) -> mpm.Simulation:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; that of the levee is 2.5 h")
     parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; those of the levee: 9 times")

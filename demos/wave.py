@@ -124,7 +124,7 @@ def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the columns")
     parser.add_argument("--steps", type=int, default=50, help="steps a period of the load that swings")

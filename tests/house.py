@@ -27,7 +27,7 @@ SOURCE = re.compile(
 PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-]+), cells ([\d.e+-]*[\d])")
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""
-STYLES = ("figsize", "alpha", "dpi")
+STYLES = ("figsize", "alpha", "dpi", "bounds")
 CONDITIONS = (
     "Traction",
     "Pressure",

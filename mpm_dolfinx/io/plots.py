@@ -69,7 +69,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     if bar:
         known = unit(field)
         label = label or field.replace("_", " ") + (f" ({known})" if known else "")
-        ax.figure.colorbar(drawn, cax=ax.inset_axes((1.03, 0, 0.04, 1)), label=label)  # as high as the body
+        ax.figure.colorbar(drawn, cax=ax.inset_axes(bounds=(1.03, 0, 0.04, 1)), label=label)  # as high as the body
     return ax
 
 
