@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A bank of clay loses its strength and slides against a rigid barrier: run-out with and without it, force on it.
+"""A bank of clay loses its strength and slides against a rigid barrier: run-out, and force on the barrier.
 
 Half of a bank of undrained clay, 10 m high and as long, stands with a vertical side on a rough floor.  Within ten
-minutes its strength c falls from 0.3 to 0.07 gamma H; 0.26 would hold it.  Inertia is left out: a viscous stress
-2 eta D, a term in UFL, lets the clay move only so far in so much time, and is gone when it rests.  A wall that takes a
-shear of c / 2 stands in its way.
+minutes its strength c falls from 0.3 to 0.07 gamma H; it would stand with 0.26.  Inertia is neglected.  A viscous
+stress 2 eta D, a term in UFL, limits the velocity and vanishes at rest.  A wall with an adhesion of c / 2 stops the
+clay.
 
-At rest no plane bears more than c.  So each wedge between the wall and a plane through its foot, of weight W, at the
-angle theta and of length l, bounds the force F normal to the wall, on which the shear V is at most c D / 2, D the depth
-of clay there:
+At rest the shear stress on any plane is at most c.  Each wedge between the wall and a plane through its foot (weight
+W, angle theta, length l) therefore bounds the force F normal to the wall.  The shear V on the wall is at most c D /
+2, with D the depth of clay there:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
-The largest of the first is Coulomb's active force and the least of the second his passive one, for the surface as it is
-(Culmann 1866).  Planes that end in the axis are left out.  What has slid against the wall and stopped is in between.
-"""
+The largest lower bound is Coulomb's active force, and the smallest upper bound his passive force, for the present
+surface (Culmann 1866).  Planes that end in the axis are left out.  The measured force at rest lies between both."""
 
 from __future__ import annotations
 

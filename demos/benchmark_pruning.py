@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""What a scene saves by what it does without: each feature measured in a pair of scenes, with and without it.
+"""Cost of each feature of a scene, measured in a pair of scenes with and without it.
 
-A square block of 1 m between smooth walls is pressed on its top, little enough that the active cells stay.  In each
-pair one feature is left out, or is there and does next to nothing: gravity of zero, a conductivity of 1e-30 m/s, a
-plastic law far from yielding, a stabilisation with nothing to damp.  `settlement` is the largest relative
-difference of the answers; with mean dilatation it is that of the two Poisson ratios.
+A square block of 1 m between smooth walls is pressed on its top, so little that the active cells stay the same.  In
+each pair one feature is left out, or is present with almost no effect.  Examples are a gravity of zero, a
+conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation without anything to damp.  `settlement`
+is the largest relative difference of the answers.  With mean dilatation it is the difference between the two Poisson
+ratios.
 
-Steps of both scenes are taken in turn, --repeat times; the least of each counts, since other work on the machine
-only adds.  Compile time is what the scene and its first step take longer in a process with an empty cache of
-compiled forms than in one that finds them; memory the peak of the latter.  All times are processor times.
+Steps of both scenes alternate, --repeat times.  The shortest of each counts, since other work on the machine only adds.
+The compile time is the extra time of the scene and its first step with an empty cache of compiled forms.  Memory is the
+peak with a full cache.  All times are processor times.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Where one linear solver becomes better than another: both are timed on each side of the thresholds of the plan.
+"""Thresholds between linear solvers: both solvers are timed on each side of the thresholds of the plan.
 
-Each row is a scene of so many unknown displacements, stepped with the threshold moved so that either route is taken.
-Times are processor times of two steps, the least of --repeat turns.  The table stands in
+Each row is a scene of a given number of displacement unknowns.  The threshold is moved so that either solver is used.
+Times are processor times of two steps, the shortest of --repeat turns.  The table is in
 `mpm_dolfinx/solve/solver_choice.py`.
 """
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""A cylindrical cavity is widened in clay and in sand, on a grid of squares.
+"""Expansion of a cylindrical cavity in clay and in sand, on a grid of squares.
 
-A quarter of a ring of soil, b = 5 a0.  The given displacement of its wall is a fifth of a cell in a step, undrained a
-tenth: laws with history are integrated to first order, and with eight cells and steps of a fifth the radial solution
-itself has pore pressures that are 1.5 % too low at a = 1.1 a0, where normally consolidated clay is still yielding.
+A quarter of a ring of soil has b = 5 a0.  The prescribed displacement of its wall is a fifth of a cell in a step, and a
+tenth if undrained, because laws with history are integrated to first order.  With eight cells and steps of a fifth of a
+cell, the radial solution itself has pore pressures 1.5 % too low at a = 1.1 a0 in yielding normally consolidated clay.
 
-1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water moves, its outside
-   under the pressure that it began with.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
-2. Then the wall is held and the clay drains at its outside: its excess pressures dissipate.
-3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr and Coulomb's sand, phi = 30
-   degrees, without and with associated dilation (Yu and Houlsby 1991).  These are in soil without end: the outside of
-   the ring goes where a radial solution has it (`mpm_dolfinx.verification.cavity`).
+1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water flows.  The outside
+   keeps its initial pressure.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
+2. Then the wall is fixed and the clay drains at its outside: its excess pressures dissipate.
+3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
+   degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
+   outside of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
-Pressures are over p_0.  Errors are those at the marks, relative.
+Pressures are over p_0.  Errors are relative, at the marks.
 """
 
 from __future__ import annotations

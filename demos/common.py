@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the demos share: options, first and last lines, tables, pictures, and two terms in UFL."""
+"""Functions of several demos: options, first and last lines, tables, pictures, and two terms in UFL."""
 
 from __future__ import annotations
 

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""How many iterations the coupling of displacement and pore pressure takes, from drained to undrained.
+"""Iterations of the coupling between displacement and pore pressure, from drained to undrained.
 
-The linear systems of Newton's first step are solved to 1e-8 (true residual) for a cantilever (the
-poroelastic beam, at rest and bent) and a footing on a column.  The product of conductivity and step, which alone
-matters, goes from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s), the water from soft (1e4 Pa)
-to incompressible.  Compared are the package's conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with the
-filtered fixed-stress operator C + beta (V - 3/4 L) and with the plain one, C + beta V; and the plain
-fixed-stress iteration (Richardson's) with beta = 0.5, 0.75 and 1 times alpha²/K_dr and with 1/K_w,
+The linear systems of Newton's first step are solved to 1e-8 (true residual).  Scenes are a cantilever (the poroelastic
+beam, at rest and bent) and a footing on a column.  Only the product of conductivity and step matters.  It goes from
+1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The water goes from soft (1e4 Pa) to incompressible.
+
+Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with
+the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C + beta V.  The
+third is the plain fixed-stress (Richardson) iteration with beta = 0.5, 0.75 and 1 times alpha²/K_dr, and with 1/K_w,
 which diverges.  An iteration is one solve of the storage and one of the momentum.
 
-Undrained, Q1/DG0 does not see checkerboard modes of the pressure.  Only the damping of pressure jumps
-(`storage.py`) bounds them, and with them the count.  The second picture shows the pressure with and without it.
+Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
+bounds them, and with them the number of iterations.  The second picture shows the pressure with and without it.
 """
 
 from __future__ import annotations

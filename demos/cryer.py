@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Cryer's sphere: pressed all around and drained at its surface, the pressure at its centre rises at first.
+"""Cryer's sphere: loaded all around and drained at its surface, with a rise of pressure at its centre.
 
-A saturated ball is loaded by an even normal traction p0 at once, and kept; its surface is drained.  The outer
-shell gives up its water, shrinks and presses on the core: the pressure at the centre rises by nearly a third above
-p0 before it falls (Cryer 1963), which no uncoupled theory of consolidation can show.  Fluid and grains are
-incompressible, nu = 0.25.  One octant is computed: a lattice of boxes, bent into the ball by a smooth map; or, with
---axisymmetric, a quarter of a disc.
+A saturated sphere is loaded at once by a constant normal traction p0, and its surface is drained.  The outer shell
+drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
+falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Fluid and grains are incompressible,
+nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the sphere; with --axisymmetric, a quarter
+of a disc.
 
-Errors, of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its
-greatest value, and `curve`, the greatest over T from 0.02 on, over p0.
-"""
+Errors of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its largest
+value, and `curve`, the largest over T from 0.02 on, over p0."""
 
 from __future__ import annotations
 

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""A body that comes back: what load cycles and a turn by 360 degrees leave in it.
+"""Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
-The drained beam of `poroelastic_beam.py` is loaded and unloaded again and again.  It is elastic: without load it must
-be free of stress.  The grid's displacements have kinks at grid lines.  Domains that followed them would collect stress
-with every line that they cross, as standard MPM does at its points.  A block that is stretched between two held sides
-and then turned by 360 degrees must end with the stresses that it began with.  Undrained the beam is clamped at singular
-edges: the stress there is that of r^(x - 1), cos(pi x / 2) = x, x = 0.595 (Williams 1952), so its rms within a few
-cells of them falls as h^x, and so does the stress that is left.  It is given for the whole beam, far from the clamp,
-near it, and with springs in its place.
+The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly.  It is elastic, so it must be free of
+stress without load.  The grid's displacements have kinks at grid lines.  Domains that follow these kinks would
+collect stress with every line that they cross, as the points of standard MPM do.
+
+A block is stretched between two fixed sides and then rotated by 360 degrees.  It must end with its initial stresses.
+
+The undrained beam has singular edges at its clamp.  The stress there is singular as r^(x - 1), with cos(pi x / 2) = x,
+x = 0.595 (Williams 1952).  Its rms within a few cells of the edges falls as h^x, and so does the residual stress.  The
+results are for the whole beam, far from the clamp, near it, and with springs in its place.
 """
 
 from __future__ import annotations

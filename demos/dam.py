@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
 """A dam: seepage with a free surface, as the reservoir falls.
 
-A dam of 6 m with slopes of 1:2 on an impervious base.  The water of its pores is level with the reservoir, 5 m, when
-its other slope is opened; the flow settles to a steady one.  Then the reservoir falls by 2 m in five days, and the
-free surface follows as the soil drains.  Water flows below the free surface only, and pores lose a tenth of the soil's
-volume as it falls (`mpm.unsaturated`); the reservoir presses on the slope that it wets, and both slopes are seepage
-faces above it.
+A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the pore water is level with the reservoir, 5
+m. Then the other slope is opened, and the flow becomes steady.  Then the reservoir falls by 2 m in five days, and the
+free surface follows as the soil drains.  Water flows below the free surface only.  As the surface falls, a tenth of
+the soil's volume drains from the pores (`mpm.unsaturated`).  The reservoir loads the wet slope.  Above the water,
+both slopes are seepage faces.
 
-Check: `flow`, what leaves a rectangular dam (10 m and 2 m of water at its sides, 9.6 m wide) over the exact
-k (H1^2 - H2^2) / (2 L) of Dupuit and Charny, whatever its free surface is; `steady`, what enters the dam over what
-leaves it before the reservoir falls; and `drained`, what a column loses until the free surface in it has fallen from
-8 m to 4 m above its base, where the head is 2 m, over the exact one.
+Checks:
+
+* `flow`: outflow of a rectangular dam (10 m and 2 m of water at its sides, 9.6 m wide) over the exact
+  k (H1^2 - H2^2) / (2 L) of Dupuit and Charny, which holds for any free surface;
+* `steady`: inflow of the dam over its outflow, before the reservoir falls;
+* `drained`: outflow of a column over the exact one, while its free surface falls from 8 m to 4 m above its base, with a
+  head of 2 m there.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""What accuracy costs: error against run time, material points beside finite elements, in one run.
+"""Error against run time, for material points and finite elements, in one run.
 
-Five cases with an exact or converged solution.  In each, cell size, points per cell, quadrature and
-coupling of the material points are varied, beside body-fitted finite elements on the same grid
-(Q1/DG0, the peer) and Taylor-Hood elements.  Time is that of the time loop, the least of `--repeat`
-runs; compile times are listed apart.  Truths are converged in space and in time.
+Five cases have an exact or converged solution.  In each, cell size, points per cell, quadrature and coupling of the
+material points vary.  The finite elements are body-fitted: Q1/DG0 on the same grid, and Taylor-Hood.  The time is the
+shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged in space
+and in time.
 
 * beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, usually in the first, and
-  that from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
+  from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
 * drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
 * terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
 * column: height of the soft column under its own weight, exact

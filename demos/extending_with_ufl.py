@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Physics of your own in a few lines of UFL: columns, each beside its exact solution.
+"""Physics of your own in a few lines of UFL: columns, each with its exact solution.
 
-A column of 1 m between smooth walls stands on a floor (plane strain).  Each time something is added: a stored
-energy, fibres whose direction is stored on the points, a conductivity that depends on the deformation (twice), an
-elastic foundation, a source of fluid, a law with a state of its own, plastic flow, an equation that a stress solves, a
-return in numpy.  What a function takes is read from the names of its arguments; `materials/skeleton.py` and
-`materials/user_functions.py` of the package list them.
+A column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature: a stored energy,
+fibres with directions on the points, two conductivities that depend on the deformation, an elastic foundation, a source
+of fluid.  Others add a law with its own state, plastic flow, an implicit stress, and a return mapping in numpy.  The
+parameters of a function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the package
+list them.
 
 Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for
-energy and fibres, whose layers are stretched in the one step that they take; 3e-3 for both conductivities, 6e-4 for
-the foundation and 5e-4 for the source, which fall with the cell size; 1e-5 for the damage, whose top gives way a
-little; 1e-11 for plastic flow, the equation and the return.
-"""
+energy and fibres, with stretched layers in their single step; 3e-3 for both conductivities, 6e-4 for the foundation
+and 5e-4 for the source, all of which fall with the cell size.  The damage has 1e-5, because its top yields a little.
+Plastic flow, the implicit stress and the return mapping have 1e-11."""
 
 from __future__ import annotations
 

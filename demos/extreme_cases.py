@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Stiff and extreme scenes: each converges, recovers or is refused, none is silently wrong.
+"""Stiff and extreme scenes: each converges, recovers or is refused, and none is silently wrong.
 
-Every scene is tiny, and one thing about it is extreme.  It ends in one of
+Every scene is tiny and has one extreme property.  It ends in one of
 
-* converged: within its family's bound of an exact solution, of finite elements of the same law, or of the
-  same scene at a moderate setting; both residuals and the fluid balance below 1e-8;
-* recovered: the same, after steps that were cut;
-* refused: with an error that says why; a scene that has no equilibrium must be refused;
-* warned: off by more than the bound, as the package has said in a warning;
-* wrong, nan or hung: a defect.  The exit status says whether there was none.
+* converged: within its family's bound of an exact solution, of finite elements with the same law, or of the same
+  scene at a moderate setting; both residuals and the fluid balance below 1e-8;
+* recovered: the same, after cut steps;
+* refused: with an error that gives the reason; a scene without equilibrium must be refused;
+* warned: error above the bound, with a warning of the package;
+* wrong, nan or hung: a defect, which the exit status reports.
 
-An error is relative to the largest exact value, unless its family says otherwise.  The condition number is that
-of the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.
-On one process.
+An error is relative to the largest exact value, unless its family defines another one.  The condition number is that of
+the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On one
+process.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A box slides, a ball rolls and another one bounces down an incline, beside what rigid ones do.
+"""A box slides, a ball rolls and another ball bounces down an incline: distances against rigid-body motion, energies.
 
-The incline, 30 degrees to the grid, is rough, mu = 0.3.  A rigid box slides down it by (sin b - mu cos b) g t^2 / 2, a
-disc, mu > tan b / 3, rolls by sin b g t^2 / 3.  Another one falls on it by its own radius: until it strikes it flies,
-then it bounces and turns.  Box and balls are stiff rubber, one body each that touches nothing but the incline.  What
-their weight gives is what they have in the end, but for what friction takes, and what waves in them lose.  Needs gmsh.
-"""
+The incline, 30 degrees to the grid, is rough, mu = 0.3.  A rigid box slides by (sin b - mu cos b) g t^2 / 2.  A rigid
+disc, mu > tan b / 3, rolls by sin b g t^2 / 3.  Another disc falls on the incline from a height of its own radius.
+It flies until the impact, then bounces and rotates.  Box and discs are stiff rubber.  Each is a single body that
+touches the incline only.  The work of gravity is the energy at the end, less friction and the loss to waves.  Needs
+gmsh."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""A tissue as a picture shows it: grey values are stiffness, black are holes; compressed by a plate, and drained.
+"""Tissue from an image: grey values are stiffness, black pixels are holes; compressed by a plate, and drained.
 
-The picture is made here, by smoothed noise; one from a scanner, as an array, does as well.  Each pixel is a cell of
-the grid.  `mpm.shape` keeps what is not black, and the law's constants are functions of place that look the grey value
-up: from black to white tissue becomes ten times as stiff and less permeable.  A rigid plate that lets water through
-presses it between smooth walls by an eighth of its height; its holes are sealed.  On one process.
+The image is smoothed noise, made here; a scanner's array works as well.  Each pixel is a cell of the grid.
+`mpm.shape` keeps all pixels that are not black.  The constants of the law are functions of position that look up the
+grey value. From black to white, tissue becomes ten times as stiff and less permeable.  A rigid permeable plate
+compresses it between smooth walls by an eighth of its height.  The holes are no-flow.  On one process.
 
-Checks: `modulus`, stress over strain of the drained tissue under a small load, over that of Taylor-Hood elements of
-which each pixel is one (holes are elements of a millionth of the stiffness), less 1; and `drained`, the settlement of
-the wet tissue in the end over that of dry tissue, less 1.  Both fall with the pixels' size.
+Checks: `modulus` is stress over strain of the drained tissue under a small load, relative to Taylor-Hood elements, one
+for each pixel; holes are elements of a millionth of the stiffness.  `drained` is the final settlement of the wet tissue
+relative to dry tissue.  Both errors fall with the size of the pixels.
 """
 
 from __future__ import annotations

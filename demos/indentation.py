@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A rigid cylinder is pressed into a wet gel, held there, and the force on it relaxes as the gel drains.
+"""A rigid cylinder is pressed into a wet gel and held, and its force relaxes as the gel drains.
 
-Plane strain; half of the gel, 5 m wide and high, on a smooth base.  It drains at its side, far from the
-cylinder, which goes down at once.
+Plane strain; half of the gel, 5 m wide and high, on a smooth base.  It drains at its side, far from the cylinder, which
+moves down at once.
 
-* At once no water moves and the gel is incompressible.  The pressure under the cylinder is Hertz's,
+* Immediately no water flows and the gel is incompressible.  The pressure under the cylinder is Hertz's,
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
-  E* = 4 G of the undrained gel.  Of a layer this holds for the force F that it bears.
-* In the end the pressure of the water is gone.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel, and
-  the force that of a dry scene, which is run beside it.
+  E* = 4 G of the undrained gel.  In a layer this holds for the actual force F.
+* Finally the pore pressure has dissipated.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel, and the
+  force equals that of a dry scene, which the demo also runs.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Water soaks into soil that is not saturated, beside exact and converged solutions.
+"""Water infiltrates unsaturated soil, with exact and converged solutions.
 
-Left: rain on exponential soil (`Gardner`) above a water table, a tenth of what it conducts for ever, nine tenths from
-t = 0 on; heads beside the series of Srivastava and Yeh (1991).  Right: a wet surface above dry soil (`VanGenuchten`),
-the second case of Celia, Bouloutas and Zarba (1990), beside the converged solution of Richards' equation.
+Left: rain on exponential soil (`Gardner`) above a water table.  The rain is a tenth of the conductivity until t = 0,
+and nine tenths after; heads against the series of Srivastava and Yeh (1991).  Right: a wet surface above dry soil
+(`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990), against a converged solution of Richards'
+equation.
 
-Errors: of the rain the largest of a head at 1, 6 and 12 h over the largest head then, of the front the place of
--5 m and the water taken in, at 6 and 12 h.  On one process.
-"""
+Errors: for the rain, the largest error of a head at 1, 6 and 12 h over the largest head at that time.  For the front,
+the position of the head -5 m and the infiltrated water, at 6 and 12 h.  On one process."""
 
 from __future__ import annotations
 

@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Mandel's slab: squeezed between rigid plates, its middle gains pressure before it drains.
+"""Mandel's slab: compressed between rigid plates, with a rise of pressure in its middle before it drains.
 
-A saturated slab between rigid, smooth, sealed plates takes a force in the first step.  Its free sides
-drain and soften first, so the plates load the middle more, and the pressure there rises above its first
-value p0 = force / (2a): the Mandel-Cryer effect, which only a two-way coupling has.  By symmetry a
-quarter is computed, a = 1 m wide and 1 m high, in plane strain, nu = 0.2, water and grains
-incompressible; the mean strain is 1e-5, so small strain is exact enough.  T = c t / a² is the reduced
-time, c = kappa (K + 4G/3).  The solution is linear over the height, which needs few cells.  Source:
-Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
+A saturated slab between rigid, smooth, impervious plates takes a force in the first step.  Its free sides drain and
+soften first, so the plates load the middle more.  The pressure there rises above its first value p0 = force / (2a):
+the Mandel-Cryer effect, which only a two-way coupling has.  By symmetry a quarter is computed, a = 1 m wide and 1 m
+high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain theory is
+accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  The solution is linear over the height, which
+needs few cells.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
 
-Errors: `p_0.01` to `p_1`, the largest over the cells of |p - exact| a / force at T = 0.01, 0.1, 0.5 and
-1, a cell's pressure compared at the cell's centroid; `p_max`, the relative error of the highest pressure
-in the innermost cell, reached at T = 0.07, and, stricter, `p_rise`, that of its rise above p0;
-`settlement`, the largest relative error of the plate's at those times.  Most of it is that of the
-cells: it falls with the square of their size.
+Errors:
+
+* `p_0.01` to `p_1`: the largest over the cells of |p - exact| a / force at T = 0.01, 0.1, 0.5 and 1, at the centroid of
+  the cell;
+* `p_max`: of the highest pressure in the innermost cell, at T = 0.07, relative;
+* `p_rise`, stricter: of its rise above p0;
+* `settlement`: the largest relative error of the plate's settlement at these times.
+
+Most of the error is spatial: it falls with the square of the cell size.
 """
 
 from __future__ import annotations

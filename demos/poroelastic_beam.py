@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""A saturated cantilever under a load that stays: a poroelastic beam of 1 m x 0.3 m.
+"""A poroelastic beam of 1 m x 0.3 m: a saturated cantilever under a constant load.
 
-A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on, raised
-linearly over the ramp and then held.  Its ends are permeable, its long sides sealed.  It is in plane
-strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water
-carries part of the load; as it drains, the beam sags by a third of its length.  Shown beside it:
-Euler-Bernoulli's small-strain beam without water, and (--reference) a body-fitted Taylor-Hood
-finite element solution of the same finite-strain Biot problem, in steps of a quarter of --dt.
-"""
+A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load rises linearly
+over the ramp and then stays.  The ends of the beam are permeable, and its long sides are no-flow.  It is in plane
+strain, or 0.1 m deep between smooth walls (--dim 3), which is equivalent.  At first the pore water carries a part of
+the load.  The beam drains and sags by a third of its length.  Two other solutions are shown: Euler-Bernoulli's
+small-strain beam without water, and (--reference) a body-fitted Taylor-Hood finite element solution of the same
+finite-strain Biot problem, in steps of a quarter of --dt."""
 
 from __future__ import annotations
 

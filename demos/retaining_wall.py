@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: MIT
 """A rigid retaining wall tilts about its toe, away from the sand or into it: active and passive pressure.
 
-The sand carries a surcharge q beside which its weight does not count; phi = psi = 30 degrees.  It lies on a rough
-floor, and rubs on the wall with the angle delta.  Pressures on the wall grow or fall until a wedge of the sand flows:
-to K q, normal to the wall.  With c cot(phi) added to both, so that cohesion does not count,
+The sand carries a surcharge q and is weightless; phi = psi = 30 degrees.  It lies on a rough floor, and the friction
+angle of the wall is delta.  The wall tilts until a wedge of the sand flows, at the pressure K q, normal to the wall.
+With c cot(phi) added to both, which removes the effect of cohesion,
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
 the upper sign passive: a zone at the wall, a fan about its crest and Rankine's zone (Prandtl, Sokolovskii).  Without
-friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the worst plane one.
+friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the critical plane one.
 
-The moment about the toe, which does the work, gives K as well.  A wall that tilts opens no gap at its toe.  One that
-slides does, and bears nothing there: the last of ten cells misses a tenth of the active thrust.  The sand is stiff:
-tilted two and a half times as far, the active thrust rises by 2.5 to 3 %.
-"""
+The moment about the toe is conjugate to the rotation and gives K as well.  A tilting wall opens no gap at its toe.  A
+translating wall opens one and carries nothing there: the last of ten cells misses a tenth of the active thrust.  The
+sand is stiff: at two and a half times the tilt, the active thrust rises by 2.5 to 3 %."""
 
 from __future__ import annotations
 

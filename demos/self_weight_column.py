@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A soft column sinks to less than half its height under its own weight.
+"""A soft column settles to less than half its height under its own weight.
 
-A dry column of 50 m between smooth walls, E = 10 kPa, nu = 0, 80 kg/m³: gravity, raised to 10 m/s² in equal
-steps, compresses it to 24.06 m, its foot to 0.3 of its length, so that points cross many cells.  The
-first Piola-Kirchhoff stress at the reference height Y carries what lies above, P = -rho0 g (l0 - Y), and
-in a column that keeps its width it is Cauchy's stress; Hencky's law gives the stretch by Lambert's W.
-Source: the column of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as
-stiff.  On one process.
+A dry column of 50 m stands between smooth walls, E = 10 kPa, nu = 0, 80 kg/m³.  Gravity, raised to 10 m/s² in equal
+steps, compresses it to 24.06 m, and its foot to 0.3 of its length, so points cross many cells.  The first
+Piola-Kirchhoff stress at the reference height Y carries the weight above, P = -rho0 g (l0 - Y).  In a column of
+constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lambert's W.  Source: the column of AMPLE
+(Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On one process.
 
-Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0),
-and the relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the
-initial height, 4.4e-4 with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points
-instead of over the pieces of their domains: its error stays at some 8 % whatever the cells.
-"""
+Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0), and the
+relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the initial height, 4.4e-4
+with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points instead of over the pieces of their
+domains.  Its error stays at some 8 % with any number of cells."""
 
 from __future__ import annotations
 

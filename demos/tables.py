@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Write the figures of README.md and demos/README.md from what the demos print.
+"""Write the figures of README.md and demos/README.md from the output of the demos.
 
-A figure is followed by a comment that names the run of a demo, the entries of what it prints as JSON, and a format:
+A comment follows each figure.  It names the run of a demo, the entries of its JSON output, and a format:
 
     | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
-What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx, its
-pictures in demos/pictures (those of its first run on the pages).  A table that a demo writes as a file stands between
+demos/results keeps the output of the demos, with the run time in `seconds` and the release of dolfinx.  demos/pictures
+keeps the pictures of the first run on the pages.  The table of a demo's file stands between
 `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
     bash demos/run.sh tables                        # writes the figures anew from demos/results

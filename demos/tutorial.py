@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The method from one cut domain to a consolidating column, to be read from top to bottom.
+"""The method, from one cut domain to a consolidating column, to be read from top to bottom.
 
-You need to know FEniCSx, but nothing of this package.  Each part prints what it has found, and ends in an assertion.
-On one process.
+You need to know FEniCSx, but nothing of this package.  Each part prints its result and ends in an assertion.  On one
+process.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Waves in columns of soil, dry and saturated, beside exact solutions.
+"""Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A load that comes all at once on a dry column, 10 m high: on a rigid base, where the wave comes back, and on a quiet
-   one, through which it leaves.  The base bears nothing until L / c, then on a rigid one 2 q until 3 L / c, on a quiet
-   one q; behind the front particles move by q / (rho c).  Stresses ring behind a front: their means are compared.
-2. A load that swings on a saturated column of 10 m, drained on top (Zienkiewicz, Chang and Bettess 1980), slow or
-   fast: settlement of the top and pore pressures, as complex amplitudes, once it swings alike in every period.  Water
-   drains from 0.3 m below the top of the slow one, little more than a cell: its settlement is not judged.
-3. The same column under a load that comes all at once, with water and grains that do not change their volume, k = 0.01
-   m/s, while no wave has come back from its base (after de Boer, Ehlers and Liu 1993): its settlement is
-   q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2 a) ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
+1. A sudden load on a dry column, 10 m high, on a rigid base, which reflects the wave, and on an absorbing base.  The
+   base carries nothing until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing one q.  Behind the
+   front particles move by q / (rho c).  Stresses oscillate behind a front, so their means are compared.
+2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), slow or
+   fast. Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
+   water drains from 0.3 m below the top, little more than a cell, and its settlement is not judged.
+3. The same column under a sudden load, with incompressible water and grains, k = 0.01 m/s, before a wave returns from
+   its base (after de Boer, Ehlers and Liu 1993).  Its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2 a)
+   ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
 
-The equations are those of displacement and pressure, u-p: water accelerates as grains do.
+The equations are the u-p form: water accelerates with the grains.
 """
 
 from __future__ import annotations
