@@ -6,14 +6,15 @@ minutes its strength c falls from 0.3 to 0.07 gamma H; it would stand with 0.26.
 stress 2 eta D, a term in UFL, limits the velocity and vanishes at rest.  A wall with an adhesion of c / 2 stops the
 clay.
 
-At rest the shear stress on any plane is at most c.  Each wedge between the wall and a plane through its foot (weight
-W, angle theta, length l) therefore bounds the force F normal to the wall.  The shear V on the wall is at most c D /
-2, with D the depth of clay there:
+At rest the shear stress on any plane is at most c.  Take a wedge between the wall and a plane through its foot, of
+weight W, angle theta and length l.  It bounds the force F normal to the wall.  The shear V on the wall is at most
+c D / 2, with D the depth of clay there:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
 The largest lower bound is Coulomb's active force, and the smallest upper bound his passive force, for the present
-surface (Culmann 1866).  Planes that end in the axis are left out.  The measured force at rest lies between both."""
+surface (Culmann 1866).  Planes that end in the axis are left out.  The measured force at rest lies between both.
+"""
 
 from __future__ import annotations
 
@@ -154,7 +155,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: dict) -> None:
-    """Print what has come of it."""
+    """Print the results."""
     print(f"run-out: {out['run_out']:.2f} m, with the barrier {out['held']:.3f} m; it stands at {WALL:g} m")
     print(f"clay at the barrier: {out['depth']:.2f} m; its force acts at {out['arm']:.3f} of that")
     kN = {name: out[name] / 1e3 for name in ("force", "most", "active", "passive")}

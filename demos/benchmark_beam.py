@@ -6,7 +6,8 @@ backward Euler, and adaptive steps.  Body-fitted finite elements are Q1/DG0 on c
 Taylor-Hood. Both are monolithic with MUMPS, to the same tolerance.  Every case runs `--repeat` times, in turn with
 the others.  The shortest time counts, since other work on the machine only adds.  Compile times are separate.  Errors
 refer to the tip at 0.02 s, at 0.06 s, and from 0.1 s on (largest), against Taylor-Hood elements converged in time
-(`beam.TRUTH`)."""
+(`beam.TRUTH`).
+"""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
 
 
 def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
-    """Return the sealed block of plastic soil, with the damping of pressure jumps of what yields or of elastic soil."""
+    """Return the sealed block of plastic soil, with the damping of pressure jumps for yielding or for elastic soil."""
     simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
     if not yields:
         simulation.scene.materials._softness.clear()
@@ -159,7 +159,7 @@ def clayey(cells: int) -> mpm.Simulation:
 
 
 def apart(cells: int, **options) -> mpm.Simulation:
-    """Return the block with another body beside it, a quarter as wide, that touches nothing."""
+    """Return the block with a second body, a quarter as wide, that touches nothing."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
     bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
@@ -275,7 +275,7 @@ def compiled(make: Make, cells: int) -> tuple[float, float]:
 
 
 def measure(name: str, cells: int, repeat: int) -> dict:
-    """Return what a pair costs without and with the feature, as lists of two."""
+    """Return the costs of a pair without and with the feature, as lists of two."""
     pair = [make(cells) for make in PAIRS[name]]
     least, tops = [np.inf, np.inf], [0.0, 0.0]
     with TemporaryDirectory() as folder:

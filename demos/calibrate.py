@@ -44,7 +44,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""By the name of a threshold: a scene of so many cells along an axis, and such numbers, then those of --quick."""
+"""For each threshold: a scene by its cells along an axis, numbers of cells, and numbers of cells with --quick."""
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:

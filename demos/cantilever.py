@@ -13,7 +13,8 @@ Errors `v_1` to `v_10` and `u_1` to `u_10`: distance of the tip's deflection v a
 L, at each alpha.  With 8 cells over the height and 40 steps: 0.05 %, 0.11 %, 0.13 %, 0.12 % and 0.02 %, 0.07 %, 0.14
 %, 0.16 %. The rod itself contributes 0.01 %, 0.03 %, 0.06 %, 0.08 % and 0.00 %, 0.01 %, 0.05 %, 0.08 %, as converged
 finite elements of the same body show.  The material points converge to these elements, finally with the square of the
-cell size."""
+cell size.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +99,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
-    """Print the tip's deflection and shortening beside the rod and the elastica."""
+    """Print deflection and shortening of the tip, the rod and the elastica."""
     print("alpha |     v/L      rod elastica  v - rod |     u/L      rod elastica  u - rod")
     for alpha, axis in out.axis.items():
         (x, y), (rod_x, rod_y), (u, v) = axis[-1] / LENGTH, rod(alpha)[-1] / LENGTH, elastica_tip(alpha)
@@ -107,7 +108,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the deformed axes beside the rod's, and the tips beside those of the elastica."""
+    """Draw the deformed axes with the rod's, and the tips with the elastica's."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.8))
     for i, (alpha, axis) in enumerate(out.axis.items()):
         left.plot(*rod(alpha).T, color="black", lw=1, label=None if i else "shear-flexible rod")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A square cantilever in 3D with a load inclined to the grid: its tip, the number of load steps, and the cost of a step.
+"""A square cantilever in 3D with a load inclined to the grid: tip, number of load steps, and cost of a step.
 
 A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5.  A
 square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, as
@@ -133,7 +133,7 @@ def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
 
 
 def report(o: Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
-    """Print the tips beside the rod's."""
+    """Print the tips and the rod's."""
     u, v = rod(o.alpha)
     rows = {steps: (tip @ ALONG, tip @ ACROSS, -tip[0]) for steps, tip in zip(o.steps, tips, strict=True)}
     head = ["load steps", "along (m)", "across (m)", "shortening (m)"]

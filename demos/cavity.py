@@ -40,7 +40,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, whose indices are those of v over the Cauchy stress."""
+    """Return the clay of Chen and Abousleiman, with indices of v over the Cauchy stress."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
@@ -127,7 +127,7 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 
 @dataclass
 class Undrained:
-    """What an undrained push and the consolidation after it give.
+    """Results of an undrained expansion and of the consolidation after it.
 
     total, water: radius -> pressure in the hole less p_0, and pore pressure at its wall, over p_0, with the exact ones;
     profiles: (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.

@@ -273,7 +273,7 @@ def tabulate(path: Path, rows: list[list[str]]) -> None:
 
 
 def draw(o: Namespace, counts: list[Count]) -> None:
-    """Draw iterations against k dt: the scenes beside each other, a colour a scheme, a line style a cell size."""
+    """Draw iterations against k dt: panels are scenes, colours schemes, line styles cell sizes."""
     fig, ((*axes, side),) = common.figure(1, len(SCENES) + 1, (16, 4.6))
     styles = dict(zip(o.h, ("-", "--", ":", "-."), strict=False))
     for ax, scene in zip(axes, SCENES, strict=True):
@@ -296,7 +296,7 @@ def draw(o: Namespace, counts: list[Count]) -> None:
 
 
 def draw_pressure(o: Namespace, runs: dict) -> None:
-    """Draw the undrained pressure of the cells beside each other, for the middle one of the cell sizes."""
+    """Draw the undrained pressure of the cells in two panels, for the middle cell size."""
     h = o.h[len(o.h) // 2]
     fig, (axes,) = common.figure(1, len(LAWS), (13, 3.9))
     limit = np.nanmax(np.abs(cells(runs[h, "damped"][0]))) / 1e3

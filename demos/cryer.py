@@ -8,7 +8,8 @@ nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the 
 of a disc.
 
 Errors of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its largest
-value, and `curve`, the largest over T from 0.02 on, over p0."""
+value, and `curve`, the largest over T from 0.02 on, over p0.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +64,7 @@ def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
 
 @dataclass
 class Outcome:
-    """Reduced times (m,), pressures at the centre over p0 (m,), and what the run took."""
+    """Reduced times (m,), pressures at the centre over p0 (m,), and the cost of the run."""
 
     T: np.ndarray
     pressure: np.ndarray
@@ -126,7 +127,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
-    """Print the pressure at the centre beside the exact one."""
+    """Print the pressure at the centre and the exact one."""
     shown = np.unique(np.linspace(0, len(out.T) - 1, 13).astype(int))
     rows = ([f"{x:.4f}" for x in (out.T[k], out.pressure[k], exact(out.T[k]))] for k in shown)
     common.table([["T", "p/p0", "exact"], *rows])
@@ -136,7 +137,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure at the centre beside the exact one."""
+    """Draw the pressure at the centre and the exact one."""
     fig, ((ax,),) = common.figure(1, 1, (7, 4.5))
     T = np.linspace(1e-3, out.T[-1], 400)
     ax.plot(T, exact(T), color="black", lw=1, label="Cryer (1963)")

@@ -46,7 +46,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the root mean square of the points' stress, Pa, that of those nearer to the wall than `away` as none."""
+    """Return the root mean square of the points' stress, Pa, with zero for points nearer to the wall than `away`."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -65,7 +65,7 @@ def cycle(
     fluid: mpm.Fluid | None = None,
     springs: float = 0.0,
 ) -> dict:
-    """Load and unload the beam; return what is left of it, and how it has moved.
+    """Load and unload the beam; return the residual stress and the motion.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ def cycle(
     Returns
     -------
     left: rms of the stress after each cycle over that at the first peak; away: the same but at the wall; times, tips
-    (m): of each step; lost: work that the load has done in each cycle over that up to the first peak; volume: change of
-    the beam's beside that of its water; balance: of the fluid.
+    (m): of each step; lost: work of the load in each cycle over that up to the first peak; volume: change of the beam's
+    volume less that of its water; balance: of the fluid.
     """
     o = options(h, load, quadrature)
     cells = np.rint(beam.BOX / h).astype(int)
@@ -259,7 +259,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndarray, np.ndarray]) -> None:
-    """Draw the stress that is left against the cycles, and the last cycle beside the finite elements."""
+    """Draw the residual stress against the cycles, and the last cycle with the finite elements."""
     fig, ((left, loop),) = common.figure(1, 2, (11, 4.2))
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
         left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")

@@ -9,11 +9,11 @@ both slopes are seepage faces.
 
 Checks:
 
-* `flow`: outflow of a rectangular dam (10 m and 2 m of water at its sides, 9.6 m wide) over the exact
-  k (H1^2 - H2^2) / (2 L) of Dupuit and Charny, which holds for any free surface;
+* `flow`: outflow of a rectangular dam over the exact k (H1^2 - H2^2) / (2 L) of Dupuit and Charny.  The dam is 9.6 m
+  wide, with 10 m and 2 m of water at its sides;
 * `steady`: inflow of the dam over its outflow, before the reservoir falls;
-* `drained`: outflow of a column over the exact one, while its free surface falls from 8 m to 4 m above its base, with a
-  head of 2 m there.
+* `drained`: outflow of a column over the exact one.  Its free surface falls from 8 m to 4 m above its base, where the
+  head is 2 m.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: of the reservoir's fall; after it 
 
 @dataclass
 class Dam:
-    """What has been seen in steady flow and at each of `SEEN`: flows, corners and pressures.
+    """Flows, corners and pressures in steady flow and at each of `SEEN`.
 
     flows: (2,), m^2/s, out of both slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
     """
@@ -56,7 +56,7 @@ class Dam:
         self.balance = max(self.balance, result.balance)
 
     def see(self, simulation: mpm.Simulation) -> None:
-        """Keep what is to be seen now."""
+        """Keep the present flows, corners and pressures."""
         self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
@@ -125,7 +125,7 @@ def rectangular(cells: int) -> float:
 
 
 def drained(cells: int, k: float = 1e-5) -> float:
-    """Return what a column of 10 m, so many cells high, loses as its free surface falls, over the exact one.
+    """Return the outflow of a column of 10 m over the exact one as its free surface falls; cells over its height.
 
     With the heads h of the free surface and H at the base, dh/dt = -k (1 - H / h) / (specific yield).
     """

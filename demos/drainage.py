@@ -5,8 +5,8 @@ A column of 1 m, at rest under the weight of its water, p = 0 everywhere, is ope
 is a user's own.  The skeleton carries chi p with chi the saturation.  The reference is a converged solution with 400
 finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, over the largest pressure at that time,
-and the errors of the settlement and of the outflow at the foot.  On one process.
+Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, over the largest pressure at that
+time.  Others are errors of the settlement and of the outflow at the foot.  On one process.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
-    """Draw pressures over the height, and settlements over time, beside the converged ones."""
+    """Draw pressures over the height, and settlements over time, with the converged ones."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")

@@ -65,7 +65,7 @@ def lift(grid: mpm.Grid, k: int):
 
 @dataclass
 class Bund:
-    """What has been seen: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
+    """Histories: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
 
     frames: title, corners (n, 4, 2), m, and excess pressures (n,), Pa; carried: share of the lifts' weight that the
     lowest points carry at the end.

@@ -8,9 +8,10 @@ parameters of a function select its arguments.  `materials/skeleton.py` and `mat
 list them.
 
 Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for
-energy and fibres, with stretched layers in their single step; 3e-3 for both conductivities, 6e-4 for the foundation
-and 5e-4 for the source, all of which fall with the cell size.  The damage has 1e-5, because its top yields a little.
-Plastic flow, the implicit stress and the return mapping have 1e-11."""
+energy and fibres, with stretched layers in their single step; 3e-3 for both conductivities,
+6e-4 for the foundation and 5e-4 for the source.  They fall with the cell size.  The damage has 1e-5, because its top
+yields a little.  Plastic flow, the implicit stress and the return mapping have 1e-11.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +44,7 @@ def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> m
 
 @dataclass
 class Example:
-    """What a column gives, found (n,) and exact (n,), over the abscissa x (n,)."""
+    """Result of a column, found (n,) and exact (n,), over the abscissa x (n,)."""
 
     title: str
     xlabel: str
@@ -66,7 +67,7 @@ def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of what the cells hold (m), upwards, and the cells' pore pressures (Pa)."""
+    """Return the heights of the centroids in the cells (m), upwards, and the cells' pore pressures (Pa)."""
     cells = s.cells()
     order = np.argsort(cells.x[:, 1])
     return cells.x[order, 1], cells.pressure[order]
@@ -151,7 +152,7 @@ def of_strain(conductivity, J):
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Press water upwards through a column of two layers, of which the load squeezes the lower one more."""
+    """Press water upwards through a column of two layers; the load compresses the lower one more."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)
@@ -376,7 +377,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, examples: list[Example]) -> None:
-    """Draw every example beside its exact solution."""
+    """Draw every example with its exact solution."""
     fig, axes = common.figure(5, 2, (6.5, 11))
     for ax, e in zip(axes.flat, examples, strict=True):
         ax.plot(e.x, e.exact, color="black", lw=1, label="exact")

@@ -3,8 +3,8 @@
 
 Every scene is tiny and has one extreme property.  It ends in one of
 
-* converged: within its family's bound of an exact solution, of finite elements with the same law, or of the same
-  scene at a moderate setting; both residuals and the fluid balance below 1e-8;
+* converged: within its family's bound of an exact solution, of finite elements, or of the same scene at a moderate
+  setting.  Both residuals and the fluid balance are below 1e-8;
 * recovered: the same, after cut steps;
 * refused: with an error that gives the reason; a scene without equilibrium must be refused;
 * warned: error above the bound, with a warning of the package;
@@ -48,7 +48,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """What became of a case; worst residual and balance of its steps, iterations in all."""
+    """Outcome of a case; worst residual and balance of its steps, total iterations."""
 
     family: str
     setting: str
@@ -148,7 +148,7 @@ def table(head: list[str], rows: list[list]) -> str:
 
 
 def summary(rows: list[Row]) -> str:
-    """Return a line a family: what it shows, its bound, counts of the outcomes and worst figures."""
+    """Return a line for each family: subject, bound, counts of the outcomes and worst figures."""
     names = ("error", "residual", "balance", "condition")
     lines = []
     for name, f in FAMILIES.items():

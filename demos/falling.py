@@ -5,7 +5,8 @@ The incline, 30 degrees to the grid, is rough, mu = 0.3.  A rigid box slides by 
 disc, mu > tan b / 3, rolls by sin b g t^2 / 3.  Another disc falls on the incline from a height of its own radius.
 It flies until the impact, then bounces and rotates.  Box and discs are stiff rubber.  Each is a single body that
 touches the incline only.  The work of gravity is the energy at the end, less friction and the loss to waves.  Needs
-gmsh."""
+gmsh.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +102,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the shapes on their way, the ways beside those of rigid bodies, and energies."""
+    """Draw the shapes in motion, their distances and the rigid ones, and energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)

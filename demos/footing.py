@@ -14,7 +14,7 @@ Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with frictio
 N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  The limit loads use very stiff soil, which flows before
 the geometry changes, with --cells over the width and about twice as many.
 
-For the deep push the soil does not dilate.  Its undrained strength is s_u = xi c, and a base at depth D carries
+For the deep push the soil does not dilate.  Its undrained strength is s_u = xi c.  A base at depth D carries
 (1 + 0.27 sqrt(D/B)) times as much (fit to bounds of limit analysis, Salgado et al. 2004).  Its drained capacity at the
 surface lies between that of Davis's (1968) reduced friction and c N_c.
 
@@ -28,12 +28,13 @@ cells, laws therefore use half of the deviation of the gradient from its mean: -
 
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 
-With --graded, cells grow by a tenth from one to the next, up to eight times, outside of a fine box of 2 B x 0.75 B
-below the footing.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B with fine cells only.
+With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside of it, cells grow by a tenth from one to the
+next, up to eight times.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B with fine cells only.
 
-With non-associated flow the answer is not unique.  Shear bands one cell wide jump from place to place, more so with
-finer cells (Rudnicki and Rice 1975), and on fine grids many steps are cut.  --viscosity adds a resistance to the
-shear rate, small compared with the cohesion, which makes the answer unique (Needleman 1988)."""
+With non-associated flow the answer is not unique.  Shear bands one cell wide jump from place to place, more
+so with finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a resistance to the
+shear rate, small compared with the cohesion, which makes the answer unique (Needleman 1988).
+"""
 
 from __future__ import annotations
 
@@ -160,7 +161,7 @@ def push(
     rest
         Time of consolidation after the push, over B²/c_v.
     steps
-        Equal steps of the push; by default those of `STEP`.
+        Equal steps of the push; by default from `STEP`.
     circular
         A disc of the diameter B, not a strip.
     method
@@ -207,7 +208,7 @@ def push(
 
 
 def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
-    """Push the footing into very stiff soil; its loads are over those of the theory.
+    """Push the footing into very stiff soil; its loads are relative to theory.
 
     box, graded: see `push`; by default that of `LIMITS_OF`, of equal cells.
     """
@@ -272,7 +273,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def of_many_sizes(cells: int, folder: Path) -> dict:
-    """Print and draw the undrained limit load in a large box of graded cells beside a small one of equal cells.
+    """Print and draw the undrained limit load in a large box of graded cells and in a small one of equal cells.
 
     Returns it with the points and the seconds of processor time.
     """
@@ -319,7 +320,7 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
 
 
 def effort(cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0) -> dict:
-    """Push at the intermediate rate in equal steps; print what they took and return it.
+    """Push at the intermediate rate in equal steps; print their cost and return it.
 
     width: of half the soil, over B; viscosity: see `viscous`.
     """
@@ -350,7 +351,7 @@ def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
 
 
 def twice_the_box(cells: int, depth: float) -> dict[str, float]:
-    """Print by how much loads change at most in a box twice as wide, over those in `BOX` at that depth; return it."""
+    """Print the largest change of load in a box twice as wide, over the load in `BOX` at that depth; return it."""
     out = {}
     for name, rate in RATES.items():
         near, far = (push(SOIL, cells, depth, rate, box=(wide * BOX[0], BOX[1])) for wide in (1, 2))
@@ -363,7 +364,7 @@ def twice_the_box(cells: int, depth: float) -> dict[str, float]:
 
 
 def report(runs: dict[str, Push]) -> dict:
-    """Print what the pushes were like and return it."""
+    """Print the results of the pushes and return them."""
     out = {}
     for name, run in runs.items():
         out[name] = found = {
@@ -455,7 +456,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
 
 
 def draw_loads(ax, runs: dict[str, Push]) -> None:
-    """Draw load over settlement at all rates beside the theory."""
+    """Draw load over settlement at all rates, and the theory."""
     for (name, each), colour in zip(runs.items(), COLOURS, strict=True):
         upto = each.pushed + 1
         ax.plot(each.settlement[:upto], each.load[:upto], color=colour, label=f"{name}, V = {RATES[name]:g}")
@@ -475,7 +476,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
 
 
 def animate(out: Path, run: Push) -> None:
-    """Draw the push and what follows as an animation."""
+    """Draw the push and the consolidation as an animation."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     fig, ((ax,),) = common.figure(1, 1, (6.4, 3.9))

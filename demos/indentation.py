@@ -9,7 +9,7 @@ moves down at once.
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
   E* = 4 G of the undrained gel.  In a layer this holds for the actual force F.
-* Finally the pore pressure has dissipated.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel, and the
+* Finally the pore pressure has dissipated.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
   force equals that of a dry scene, which the demo also runs.
 """
 
@@ -85,8 +85,10 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 
 @dataclass
 class Pressed:
-    """A run: contacts at once and, if wet, in the end; forces (N/m) at once and at `TIMES`; corners, pore pressures and
-    cylinder at once; of the fluid balance the worst, and cut steps.
+    """A run.
+
+    contacts: at once and, if wet, in the end; forces: N/m, at once and at `TIMES`; frame: corners, pore pressures and
+    cylinder at once; balance: worst error of the fluid balance; cuts: cut steps.
     """
 
     contacts: list[Contact]
@@ -137,7 +139,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
-    """Draw pore pressures at once, pressures under the cylinder beside Hertz's, and the force in time."""
+    """Draw pore pressures at once, pressures under the cylinder with Hertz's, and the force in time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")

@@ -7,7 +7,8 @@ and nine tenths after; heads against the series of Srivastava and Yeh (1991).  R
 equation.
 
 Errors: for the rain, the largest error of a head at 1, 6 and 12 h over the largest head at that time.  For the front,
-the position of the head -5 m and the infiltrated water, at 6 and 12 h.  On one process."""
+the position of the head -5 m and the infiltrated water, at 6 and 12 h.  On one process.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +111,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heads: list, depths: list) -> None:
-    """Draw heads over heights beside the series, and over depths with the converged places of the front."""
+    """Draw heads over heights with the series, and over depths with the converged positions of the front."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):

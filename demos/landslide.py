@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, settles under
-its weight without inertia; its factor of safety is 1.4.  Then its strength is divided by 1.6, at once.
+A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  It
+settles under its weight without inertia; its factor of safety is 1.4.  Then its strength is divided by 1.6, at once.
 
 With inertia it accelerates until its new shape is stable, and moves on until friction stops it.  Without inertia, as
 in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then stops at
 the first stable shape, so its run-out is shorter.  Energies balance: friction dissipates the work of gravity, except
-for the elastic part."""
+for the elastic part.
+"""
 
 from __future__ import annotations
 

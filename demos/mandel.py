@@ -41,9 +41,9 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 
 @dataclass
 class Outcome:
-    """What a run gives, an entry a step: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m) of the top.
+    """Results of a run, an entry for each step: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m).
 
-    The settlements are those of eleven places from the middle to the side.
+    Settlements of the top are given at eleven places from the middle to the side.
     """
 
     time: list[float] = field(default_factory=list)
@@ -127,7 +127,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the width, and in the middle over time, beside the exact curves."""
+    """Draw the pressure over the width, and in the middle over time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     unit, scale, x = WIDTH**2 / EXACT.cv, FORCE / WIDTH, np.linspace(0, WIDTH, 201)
     for i, k in enumerate(map(out.at, SAMPLES)):

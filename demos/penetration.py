@@ -17,7 +17,8 @@ lower then.  Errors refer to the mean of N over the last part of each quarter, a
 
 Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v.  Water of the same pressure
 stands on top, so the clay starts without effective stress.  It is seeded once.  The domains ahead of the bar are
-narrower at first, by their later stretch, and end as wide as the others."""
+narrower at first, by their later stretch, and end as wide as the others.
+"""
 
 from __future__ import annotations
 
@@ -92,8 +93,8 @@ def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
 class Push:
     """A push, a step each: depths over D, resistances over s_u D, whether they count, and excess pressures over s_u.
 
-    frame: corners (n, 4, 2), m, how far points have moved over how far the bar has, since the clay was seeded (n,), or
-    excess pressures of wet clay over s_u (n,), and what the bar fills (m, 4, 2), m, at the end.
+    frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
+    motion of the points over that of the bar since the clay was seeded, or the excess pressure of wet clay over s_u.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -249,7 +250,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
 
 
 def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the end of a push, and what its frame shows."""
+    """Draw the end of a push with the field of its frame."""
     corners, values, bar = run.frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")

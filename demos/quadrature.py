@@ -4,7 +4,8 @@
 The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material is elastic, so
 the answer must not depend on n.  It does not with integration over the exact pieces of the domains.  With integration
 at the points, as in standard MPM, it drifts with every cell that a point crosses.  The finite element reference takes
-the load in ten steps."""
+the load in ten steps.
+"""
 
 from __future__ import annotations
 

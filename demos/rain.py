@@ -11,7 +11,8 @@ with the suction stress chi s of Bishop and a constant unit weight gamma.  Befor
 exponential soil: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), z above the table.
 
 Source: Lu and Godt (2008) for vertical flow; across the slope, gravity is its component.  Errors: the largest error
-of FS at 1, 2, 3 and 5 m, at rest and at the end.  On one process."""
+of FS at 1, 2, 3 and 5 m, at rest and at the end.  On one process.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list) -> None:
-    """Draw heads and factors of safety over the depth, beside the exact ones at rest and in steady rain."""
+    """Draw heads and factors of safety over the depth, with the exact ones at rest and in steady rain."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for days, depth, head, felt in curves:
         left.plot(head, depth, lw=1.4, label=f"{days:g} d")

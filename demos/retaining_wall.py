@@ -12,7 +12,8 @@ friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  
 
 The moment about the toe is conjugate to the rotation and gives K as well.  A tilting wall opens no gap at its toe.  A
 translating wall opens one and carries nothing there: the last of ten cells misses a tenth of the active thrust.  The
-sand is stiff: at two and a half times the tilt, the active thrust rises by 2.5 to 3 %."""
+sand is stiff: at two and a half times the tilt, the active thrust rises by 2.5 to 3 %.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ def coulomb(delta: float, way: int) -> float:
 
 
 def slip_line(delta: float, way: int) -> np.ndarray:
-    """Return the edge (n, 2), m, of what flows, from the toe to the surface."""
+    """Return the edge (n, 2), m, of the flowing sand, from the toe to the surface."""
     p, d = np.radians([PHI, delta])
     fan, rankine = (np.arcsin(np.sin(d) / np.sin(p)) + way * d) / 2, np.pi / 4 - way * p / 2
     at_wall, apex = np.pi / 2 - rankine - fan, np.pi / 2 - way * p
@@ -117,7 +118,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[tuple[str, float], Tilted]) -> None:
-    """Draw what flows, with its exact edge, and K as the wall tilts."""
+    """Draw the flowing sand with its exact edge, and K as the wall tilts."""
     fig, axes = common.figure(len(runs), 2, (12, 2.5 * len(runs)))
     for (left, right), ((name, delta), run) in zip(axes, runs.items(), strict=True):
         corners, strain, wall = run.frame

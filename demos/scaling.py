@@ -22,7 +22,8 @@ With runs on one and on several processes, a cost model is fitted to the seconds
 a fixed cost, work of the points (of a run, times its imbalance), halo, and messages of any size.  All terms are >= 0,
 by least squares of relative errors.  H is the number of points along the faces between processes, for a cube that is
 halved repeatedly.  Runs on more processes than processors count for messages only.  In 2D the solvers are left out:
-the cost of factorisations is not n / P."""
+the cost of factorisations is not n / P.
+"""
 
 from __future__ import annotations
 
@@ -124,7 +125,7 @@ def measure(dim: int, points: float) -> dict:
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
-    """Return what `measure` does in a process of its own, or in several."""
+    """Return the result of `measure` in its own process, or in several."""
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
@@ -198,7 +199,7 @@ def by_part(rows: list[dict], found: dict[str, float]) -> str:
 
 
 def by_processes(rows: list[dict]) -> str:
-    """Return time, memory, imbalance and what a process sends in a step as a Markdown table."""
+    """Return time, memory, imbalance and traffic of a step as a Markdown table."""
     columns = {
         "points": "points",
         "processes": "processes",
@@ -216,7 +217,7 @@ def by_processes(rows: list[dict]) -> str:
 
 
 def prediction(model: dict[str, float], dim: int) -> str:
-    """Return the cost model, and what it says of many processes."""
+    """Return the cost model, and its prediction for many processes."""
     form = f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} H + {model['c']:.2g} log2 P"
     lines = [f"{dim}D: T = {form} s, within {100 * model['worst']:.0f} % of the runs"]
     for share in (1e4, 1e5):
@@ -247,7 +248,7 @@ def draw(out: Path, rows: list[dict]) -> None:
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
-    """Draw the parts that take longest, and what a time and a memory that go with the points would be."""
+    """Draw the longest parts, and time and memory in proportion to the points."""
     n, found = np.array([row["points"] for row in rows]), exponents(rows)
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"
@@ -259,7 +260,7 @@ def draw_parts(left, right, rows: list[dict]) -> None:
 
 
 def write(out: Path, rows: list[dict]) -> dict:
-    """Write tables and pictures, print what they say; return exponents and cost models, by dimension."""
+    """Write tables and pictures, print them; return exponents and cost models, by dimension."""
     common.write_csv(out / "scaling.csv", rows[0], (row.values() for row in rows))
     text, found = [], {}
     for dim in sorted({row["dim"] for row in rows}):

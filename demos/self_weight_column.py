@@ -10,7 +10,8 @@ constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lam
 Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0), and the
 relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the initial height, 4.4e-4
 with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points instead of over the pieces of their
-domains.  Its error stays at some 8 % with any number of cells."""
+domains.  Its error stays at some 8 % with any number of cells.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +89,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome, rival: Outcome) -> None:
-    """Draw the stress over the present height beside the exact curve and that of standard MPM."""
+    """Draw the stress over the present height, with the exact curve and that of standard MPM."""
     fig, ((ax,),) = common.figure(1, 1, (6.5, 5))
     Y = np.linspace(0, EXACT.l0, 201)
     ax.plot(EXACT.stress(Y) / 1e3, EXACT.position(Y), color="black", lw=1, label="exact")

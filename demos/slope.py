@@ -7,7 +7,8 @@ A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil: phi = 20 degree
    excess over the strength dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
    Lane 1999).
 2. The strength is divided by 1.6 at once, in soil with the viscosity eta.  The slope slides until its new shape is
-   just stable: its factor of safety is then one, to a tenth."""
+   just stable: its factor of safety is then one, to a tenth.
+"""
 
 from __future__ import annotations
 

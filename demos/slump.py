@@ -21,7 +21,8 @@ The cohesion is a function of position, so the points carry it (`points.data["co
 between two steps.  A step without convergence is cut and repeated with the same strength.  This helps because a
 viscous stress 2 eta D, a term in UFL like the weight, limits the velocity of the bank.  eta / T is a hundredth of
 gamma' H; part 1 has no viscosity.  No mesh could follow: the side of the bank ends on the floor, at plastic strains
-of several hundred per cent."""
+of several hundred per cent.
+"""
 
 from __future__ import annotations
 
@@ -140,7 +141,7 @@ class Frame:
 
 @dataclass
 class Slump:
-    """What a run gives; `rest` and `drained` are the indices of the frames at which the two stages end.
+    """Results of a run; `rest` and `drained` are the indices of the frames at which the two stages end.
 
     alternating: rms, Pa, of the part of the pressures before the bank that alternates from cell to cell, at most.
     """
@@ -219,7 +220,7 @@ def slump(cells: int, steps: int) -> Slump:
 
 
 def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
-    """Return how far the results are from what they should be, relative; slopes in degrees."""
+    """Return relative errors of the results; slopes in degrees."""
     coarse, fine = (f.critical for f in failures)
     start, rest, end = run.frames[0], run.frames[run.rest], run.frames[run.drained]
     return {
@@ -261,7 +262,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(run: Slump, found: dict[str, float]) -> None:
-    """Print the stages of the slump and what the errors say."""
+    """Print the stages of the slump and the errors."""
     rows = [["", "t (s)", "run-out (m)", "height (m)", "slope", "p (kPa)"]]
     for name, k in stages(run).items():
         f = run.frames[k]

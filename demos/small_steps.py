@@ -18,7 +18,8 @@ little of the column.  The error of the remap itself is of second order and smal
 The overshoot, the largest p / p0 - 1 of all steps, is zero at rest for any step.  So the scheme has no smallest time
 step in one dimension.  In more dimensions, small steps cause checkerboard modes of the pressure, unless its jumps are
 damped (`storage.py`).  The demo shows them for a strip load on a layer in a rough box, first step, with and without
-damping.  On one process."""
+damping.  On one process.
+"""
 
 from __future__ import annotations
 

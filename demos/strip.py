@@ -12,7 +12,8 @@ Checks for q/E = 0.25 use Taylor-Hood elements, extrapolated in time, and in h f
 extrapolation moves the result of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  `settlement` is the largest
 error of the middle's displacement from T = 0.1 on, `at_once` the error at T = 0.01.  `edge` refers to the strip's
 edge, where the load jumps, and `beside` to the far corner.  All are relative to the middle.  --reference runs such
-elements on the same cells. On one process."""
+elements on the same cells. On one process.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def conditions(load: float) -> dict:
-    """Return what acts, load over E."""
+    """Return the conditions, load over E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
     return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
@@ -68,7 +69,7 @@ def times(a_decade: int) -> NDArray[np.float64]:
 
 @dataclass
 class Outcome:
-    """What has been seen: T, and displacements of PLACES over HEIGHT, up.
+    """Histories: T, and displacements of PLACES over HEIGHT, up.
 
     frames: T, corners, pressure over E and porosity of the points; why: why it ended early.
     """

@@ -37,7 +37,7 @@ TABLE = re.compile(
 
 
 def kept(run: str) -> Path:
-    """Return the file that keeps what a run has printed."""
+    """Return the file with the output of a run."""
     return RESULTS / (re.sub(r"\W+", "_", run) + ".json")
 
 
@@ -79,7 +79,7 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
 
 
 def take(run: str, table: str, pictures: bool) -> None:
-    """Run a demo, and keep what it prints, the table that it writes, and, if asked to, its pictures on the pages."""
+    """Run a demo, and keep its output, its table, and, if asked to, its pictures on the pages."""
     import dolfinx
 
     demo, *options = shlex.split(run)

@@ -32,7 +32,7 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """What a run gives, an entry an output: T_v, depth and p of the cells and settlement, all over their scales."""
+    """Results of a run, an entry for each output: T_v, depth and p of the cells, settlement, over their scales."""
 
     result: mpm.Result
     time: list[float] = field(default_factory=list)
@@ -111,7 +111,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the depth and the settlement over time beside the exact curves."""
+    """Draw the pressure over the depth and the settlement over time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, time in enumerate(SAMPLES):

@@ -9,7 +9,8 @@ at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in Kirchhoff stresses, in
 Errors refer to the ends, and are relative.
 
 --cost N compresses a block of N x N cells of Drucker-Prager, Mohr-Coulomb and Cam Clay soil until all of it yields.
-Steps alternate, and the demo prints the processor time of a step over that of Drucker and Prager's."""
+Steps alternate, and the demo prints the processor time of a step over that of Drucker and Prager's.
+"""
 
 from __future__ import annotations
 

@@ -7,7 +7,8 @@
 2. A free bar, P = E (F - 1), vibrates with strains of 5 % and flies over fifty cells in 25 periods.  In an exact
    solution its ends oscillate about the flight by A / (pi c) sin(pi c t / L), without loss of energy.  SDIRK2 itself
    loses gamma^4 y^4 / (1 + gamma^2 y^2)^2, y = omega dt, of the energy in a step.  The rest is lost in resets of the
-   grid."""
+   grid.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +115,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, beams: dict, bar: dict[str, np.ndarray], own: np.ndarray) -> None:
-    """Draw the tip of the beam, the end of the bar and its energy, beside exact ones."""
+    """Draw the tip of the beam, the end of the bar and its energy, with exact ones."""
     fig, ((tip, end, left),) = common.figure(1, 3, (14, 4.2))
     for k, h in enumerate(o.h):
         t, u, f = beams["across", h]

@@ -9,8 +9,8 @@ laws. Soil above the level of the ditch is a seepage face without outflow.
 The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  A flood rises by 2.5 m in two days, stays
 for two days and falls in two days.  Its soil drains under suction, so late infiltration leaves late.
 
-Errors: of the height of the table at six positions after 2, 3, 4 and 8 hours, the largest in m, and of the outflow into
-the ditch at the end.  `balance`: error of the water balance of the slab, over the rain.  On one process.
+Errors: the largest of the height of the table, m, at six positions after 2, 3, 4 and 8 hours; of the outflow into the
+ditch at the end.  `balance`: error of the water balance of the slab, over the rain.  On one process.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, frames: list) -> None:
-    """Draw the tables of the slab, beside converged ones, and pressures in the levee."""
+    """Draw the tables of the slab with converged ones, and pressures in the levee."""
     fig, axes = common.figure(1 + len(frames), 1, (8, 10))
     first, *others = np.ravel(axes)
     for i, (hours, x, z) in enumerate(curves):

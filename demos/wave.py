@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, dry: dict, swings: dict, loaded: dict[str, np.ndarray]) -> None:
-    """Draw stresses at the base, amplitudes of pressure over the depth, and settlements, beside exact ones."""
+    """Draw stresses at the base, amplitudes of pressure over the depth, and settlements, with exact ones."""
     fig, ((base, depth, top),) = common.figure(1, 3, (14, 4.4))
     steps = {"rigid": [0, 0, 2, 2, 0, 0], "quiet": [0, 0, 1, 1, 1, 1]}
     for k, (name, run) in enumerate(dry.items()):
