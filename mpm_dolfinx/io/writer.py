@@ -182,10 +182,7 @@ class Writer:
 
 
 def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
-    """Return porosity, saturation of unsaturated soil, stresses by components, and their invariants, by name.
-
-    Each has values (n,) at the points of this process.
-    """
+    """Return porosity, saturation, components and invariants of stresses (n,) at this process, by name."""
     asked, wet = simulation.point_fields(), simulation.scene.fluid is not None
     out = {"porosity": asked.porosity}
     if simulation.scene.materials.retentions is not None:
