@@ -632,8 +632,13 @@ class StorageProblem:
         out[self.system.unknowns.owned] = (-rates.taken(self.dt).cells - self._before.cells) / self._density
         return out
 
-    def assemble_tangent(self, data: PointData | None = None) -> None:
-        """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""
+    def assemble_tangent(
+        self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
+    ) -> None:
+        """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others.
+
+        of_suction: cells (c,), and what the forces on their nodes (c, n) gain by their pressures in laws, m^(d-1).
+        """
         forms = self.forms
         system = self.system
         data = data or self.data
@@ -641,6 +646,8 @@ class StorageProblem:
         for A, rows in zip((system.B_momentum, system.B), by_u, strict=False):
             zero(A)
             insert_rows(A, forms.grid, data.places.filled, rows)
+            for cells, more in of_suction if A is system.B_momentum else ():
+                insert_rows(A, forms.grid, cells, -more)
             A.assemble()
         self._assemble_slope(capacity)
         if forms.fluxes.relative is not None and over_all(forms.grid.comm, int(_falls(system.C))) > 0:

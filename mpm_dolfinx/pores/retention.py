@@ -290,6 +290,10 @@ class Retentions:
         """Return by how much pressures at levers (m, d), m, differ from those of cells (m,), Pa."""
         return lever @ self.weight.value
 
+    def at(self, p, points: FormPoints):
+        """Return the pressures of points in cells of pressures p, Pa, as UFL."""
+        return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
+
     def of(self, name: str, p, points: FormPoints):
         """Return a property of the pores of points in cells of pressures p, Pa, as UFL.
 
@@ -301,8 +305,7 @@ class Retentions:
             They have the fields retention and, as pieces, lever.
         """
         row = points.retention
-        if "lever" in points.sizes:
-            p = p + ufl.dot(self.weight, points.lever)
+        p = self.at(p, points)
         values = [_property(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first]
         out = values.pop(0) if self._everywhere else 1.0
         first = 2 if self._everywhere else 1
