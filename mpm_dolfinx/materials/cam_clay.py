@@ -203,7 +203,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return one of Modified Cam Clay's functions as it is under the suction of the trial: of another lambda and P_c."""
+    """Return one of Modified Cam Clay's functions as it is under suction: of another lambda and P_c."""
     taken = Skeleton.taken_by(function)
 
     def of(**given):

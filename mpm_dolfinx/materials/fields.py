@@ -183,7 +183,7 @@ class SceneMaterials:
             _known(f"{law.__name__}: unknown {name!r}", value)
         m.check_cells(mean_size(self.grid))
         if "suction" in law.state and self.fluid is not None and m.retention is None:
-            raise ValueError(f"{law.__name__}: retention is not given, must be a law of retention: it depends on suction")
+            raise ValueError(f"{law.__name__}: retention = None, must be a law of retention beside suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
             what = "has unknowns and takes cell_size, must not on a grid of cells of many sizes"
             raise ValueError(f"{law.__name__}: {what}")

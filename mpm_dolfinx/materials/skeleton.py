@@ -29,7 +29,7 @@ BY_SCENE = ("dt", "cell_size")
 """What the scene gives to laws: time since the start of the step, s, and mean length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""States that the scene sets, where a law has them: the suction max(-p, 0) of the end of a substep, and as seeded, Pa."""
+"""States that the scene sets where a law has them: suction max(-p, 0) at the end of a substep, and as seeded, Pa."""
 
 LOCKING = 0.43
 """Poisson's ratio above which the mean dilatation of a cell is used, at twice the cost of a step.

@@ -216,6 +216,11 @@ def _value(function: Callable, p: float) -> float:
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
+def chi_at(law, p: float) -> float:
+    """Return chi, the share of a pressure p, Pa, that the skeleton feels by a law."""
+    return _value(partial(_property, law, "bishop"), p)
+
+
 def _empty(function: Callable, suction: float) -> bool:
     """Return whether a function of p has fallen to a half at a suction, Pa, or is no number there."""
     try:
