@@ -151,9 +151,13 @@ class _Builder:
         frame, given = self.frame, dict(constants)
         if given.pop("kozeny_carman", False):
             given["conductivity_law"] = mpm.kozeny_carman
-        for name in ("bulk", "shear", "cohesion", "residual"):
+        for name in ("bulk", "shear", "cohesion", "residual", "reference"):
             if name in given:
                 given[name] *= frame.stress
+        if "beta" in given:
+            given["beta"] /= frame.stress
+        if "entry" in given:
+            given["retention"] = mpm.VanGenuchten(given.pop("entry") * frame.stress, n=1.8)
         if "initial_stress" in given:
             given["initial_stress"] = tuple(frame.stress * s for s in given["initial_stress"])
         if "slip" in given:
