@@ -111,6 +111,7 @@ BENCHMARK = {
     "Mohr-Coulomb beside Drucker-Prager": set(),
     "softening beside Drucker-Prager": set(),
     "Modified Cam Clay beside Drucker-Prager": set(),
+    "suction in the law": set(),
     "mean dilatation": DILATION,
     "plastic law, with mean dilatation": {"state of the law"} | DILATION,
     "finite strain": {"one factorisation for many steps"},

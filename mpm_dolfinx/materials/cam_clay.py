@@ -280,7 +280,12 @@ class BarcelonaBasic(ModifiedCamClay):
         super().__post_init__()
         if not (callable(self.kappa) or callable(self.lambda_)):
             least = np.asarray(self.kappa) / self.lambda_
-            _check(self, "r", lambda v: (v > least) & (v <= 1), f"> kappa / lambda_ = {np.max(least):g} and <= 1")
+            _check(
+                self,
+                "r",
+                lambda v: (v > least * (1 + SAME)) & (v <= 1),
+                f"> kappa / lambda_ = {np.max(least):g} and <= 1",
+            )
         _check(self, "beta", lambda v: (0 <= v) & np.isfinite(v), LC["beta"])
         _check(self, "reference", lambda v: (0 < v) & np.isfinite(v), LC["reference"])
 

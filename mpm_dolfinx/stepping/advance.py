@@ -26,7 +26,6 @@ from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import REACH, Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.materials.skeleton import DRIED
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import first, over_all
@@ -210,12 +209,12 @@ class Motion:
 
     def _dried(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
         """Return points with the suction of their pieces, which are means over them, where laws see it."""
-        if self._storage is None or DRIED[0] not in self._materials.state_names:
+        if self._storage is None or "suction" not in self._materials.state_names:
             return points
         cut, pieces = on_grid.cut, data.pieces
         p = self._storage.p.x.array[pieces.cells] + self._materials.retentions.heads(pieces["lever"])
         mean = cut.mean(cut.to_pieces(np.maximum(-p, 0.0)[:, None]))[:, 0]
-        return replace(points, data=points.data | {DRIED[0]: mean})
+        return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces.
