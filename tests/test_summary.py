@@ -120,6 +120,7 @@ BENCHMARK = {
     "layers off the grid lines": set(),
     "grid reset in each step": {"reset of the grid"},
     "16 times the background grid": set(),
+    "256 times the background grid": set(),
 }
 
 
