@@ -232,7 +232,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         partial(plastic, law=mpm.SofteningDruckerPrager, residual=1e8, slip=1e3, viscosity=1.0),
     ),
     "Modified Cam Clay beside Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
-    "suction in the law": (partial(drying, mpm.ModifiedCamClay), partial(drying, mpm.BarcelonaBasic, **LOOSE)),
+    "suction in the law": (partial(drying, law=mpm.ModifiedCamClay), partial(drying, law=mpm.BarcelonaBasic, **LOOSE)),
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),

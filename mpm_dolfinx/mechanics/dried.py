@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.cell_matrices import along_shapes
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
@@ -24,15 +25,16 @@ class OfSuction:
 
     Parameters
     ----------
+    grid
+        Background grid.
     dilatation
         Mean dilatation of cells, if any lock.
     """
 
-    def __init__(self, dilatation: MeanDilatation | None):
-        self._dilatation = dilatation
+    def __init__(self, grid: Grid, dilatation: MeanDilatation | None):
+        self._dilatation, self._width = dilatation, 2**grid.dim * grid.dim
         self._free: dict[int, CellSums] = {}
         self._locked: dict[int, CellSums] = {}
-        self._width = 0
 
     def add(self, number: int, points: FormPoints, F, slopes: Sequence, locks: bool) -> None:
         """Add a part of the pieces.
@@ -53,7 +55,6 @@ class OfSuction:
         along = [part for T in tensors for part in along_shapes(T * points.F.T, points)]
         scalars = [share * slope for slope in slopes[1:]]
         if tensors:
-            self._width = len(along) // len(tensors)
             (self._locked if locks else self._free)[number] = CellSums([*along, *scalars], points)
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:

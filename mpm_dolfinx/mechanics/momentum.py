@@ -104,7 +104,7 @@ class MomentumForms:
         """Forms of inertia, None without."""
         self._residuals, self._tangents = [], []
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
-        self._of_suction = OfSuction(self.dilatation) if dried else None
+        self._of_suction = OfSuction(grid, self.dilatation) if dried else None
         self._local: dict[int, LocalUnknowns] = {}  # by index of the part
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(
