@@ -160,7 +160,7 @@ def test_displacements_that_differ_where_they_meet_are_refused():
 
 
 def test_a_motion_that_a_wall_forbids_is_refused():
-    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a wall holds it"):
+    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a wall .* fixes it"):
         on_top((0, 2, (0, 0.01)), side="bottom").run(1, 1)
     assert on_top((0, 2, (0, 0)), side="bottom").run(1, 1).converged
 
@@ -169,7 +169,7 @@ def test_a_side_that_something_else_holds_is_named(warned):
     s = on_top((0, 0.97, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t)))  # they share a cell, and do not meet
     s.run(1, 0.5)
     messages = warned()
-    assert messages and all("not where it is to be at [" in m and "artefact" in m for m in messages)
+    assert messages and all("not at its prescribed position at [" in m and "artefact" in m for m in messages)
     assert len(set(messages)) == 2  # each once
     on_top((0, 0.8, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t))).run(1, 0.5)
     assert not warned()
@@ -274,5 +274,5 @@ def test_a_side_that_has_no_room_for_its_way_is_refused(bulk, shear):
     walls = {"bottom": "y", "left": "x", "right": "x"}
     bodies = [mpm.box(grid, [0, 0], [0.5, 1.0])]
     s = mpm.Simulation(grid, bodies, [soil], fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=[press])
-    with pytest.raises(mpm.GaveUp, match=r"come \d+% of the way that is given at most, must have room"):
+    with pytest.raises(mpm.GaveUp, match=r"follow at most \d+% of the prescribed increment, must be free"):
         s.run(1.0, 0.5, progress=False)

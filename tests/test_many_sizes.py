@@ -370,7 +370,7 @@ def test_contacts_of_groups_are_refused():
     grid = uneven(2)
     bodies = [mpm.box(grid, [0, 0], [1, 0.4]), mpm.box(grid, [0, 0.4], [1, 0.8])]
     contact = mpm.Contact([0], [1], friction=0.3)
-    with pytest.raises(ValueError, match="contacts: must be none on a grid whose cells have many sizes"):
+    with pytest.raises(ValueError, match="contacts: must be none on a grid of unequal cells"):
         mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, conditions=[contact])
 
 

@@ -180,7 +180,7 @@ def test_all_times_are_in_one_file(tmp_path, capsys):
 
 
 def test_one_file_says_what_it_cannot_do(tmp_path, monkeypatch, capsys):
-    with pytest.raises(ValueError, match=r"one_file: folder = .*: has no points\.pvd, must be that of a Writer"):
+    with pytest.raises(ValueError, match=r"one_file: folder = .*: has no points\.pvd, must be the folder of a Writer"):
         mpm.one_file(tmp_path)
     (tmp_path / "points.pvd").touch()
     monkeypatch.setitem(sys.modules, "h5py", None)
@@ -277,7 +277,7 @@ def test_a_writer_made_before_the_run_was_resumed_harms_nothing(tmp_path):
     other, probe = beam(h=0.06)
     early = mpm.Writer(other, tmp_path)
     after = mpm.resume(other, checkpoint.file)
-    with pytest.raises(ValueError, match=r"writer: made at t = 0 s for a run that goes on from t = 0\.04 s"):
+    with pytest.raises(ValueError, match=r"writer: made at t = 0 s for a run that starts at t = 0\.04 s"):
         other.run(0.06, 0.02, observe=early, after=after)
     assert list(index(tmp_path / "points.pvd")) == list(table(tmp_path / "history.csv")["t"]) == [0.0, 0.02, 0.04]
     both = r"its columns are t, .*, p_max, the run's t, .*, p_max, x_0, y_0, ux_0, uy_0, p_0;"

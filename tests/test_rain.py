@@ -23,12 +23,12 @@ def rained(flux, cells=10, retention=True, **options):
 def test_rain_beyond_what_soil_takes_ponds_and_runs_off(retention, depth, flows):
     """Steady: Darcy's flow between the pond and the base; the rest of three times the conductivity runs off."""
     s = rained(3 * K, ponding=depth * WATER, retention=retention)
-    start, soaked = water(s), 0.0
+    start = water(s)
     for _ in range(6):
         s.run(s.t + 3600, 600, progress=False)
         out, runs = 10 * s.outflows.array, 10 * s.outcome("runoff")["rain"]
-        assert -out[1] + runs == pytest.approx(3 * K, rel=1e-10)  # rain is what soaks in and what runs off
-        soaked += -out.sum()
+        if s.outcome("ponded")["rain"] == pytest.approx(depth / 10, rel=1e-12):  # else the rain fills the pond as well
+            assert -out[1] + runs == pytest.approx(3 * K, rel=1e-10)  # rain is what soaks in and what runs off
     assert [out[0], -out[1], runs] == pytest.approx([flows * K, flows * K, (3 - flows) * K], rel=1e-3)
     assert not retention or water(s) > start
 

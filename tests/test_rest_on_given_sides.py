@@ -167,6 +167,6 @@ def test_what_rests_on_springs_without_force_has_no_balance():
     def springs(u, v, points):
         return 1e9 * (points.value(u) + points.displacement)[1] * points.value(v)[1] * points.dx
 
-    with pytest.raises(ValueError, match="must be in balance with what acts at the start, and with what holds") as said:
+    with pytest.raises(ValueError, match="must be in equilibrium with loads and supports at the start") as said:
         soil(given=[], terms=[mpm.OnSide("bottom", springs)])
     assert "\n" not in str(said.value)

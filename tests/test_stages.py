@@ -124,9 +124,9 @@ def test_walls_plates_and_given_displacements_come_and_go():
     "stage, message",
     [
         ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
-        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are to come later, each once"),
+        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are still to be added, each once"),
         ({"conditions": [mpm.Drained("top")]}, "need a fluid"),
-        ({"gravity": (0, -1)}, "gravity: the scene was made without"),
+        ({"gravity": (0, -1)}, "gravity: the scene has none"),
     ],
 )
 def test_what_cannot_be_is_refused(stage, message):

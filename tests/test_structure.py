@@ -65,6 +65,7 @@ CHANGES = {
     ("Grid", "_cells"): "the mesh, made when first it is needed",
     ("CompiledForm", "_last"): "what a form is bound to, until it is bound again",
     ("Latest", "_entry"): "the key and the value that were made last",
+    ("Active", "_now"): "which cells hold something since the grid was reset",
     ("Scene", "_looks"): "what is still to be warned of",
     ("SideFeeds", "_flows"): "the active set of seepage faces",
     ("SideFeeds", "_aslant"): "what flows aslant at the start of the substep",

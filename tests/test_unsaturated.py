@@ -306,7 +306,7 @@ def test_saturated_scenes_have_nothing_of_retention():
     s.run(1, 1, progress=False)
     forms = s.scene.storage
     assert not {"retention", "lever", "pores"} & s.scene.pieces.pieces.sizes.keys()
-    assert (forms.retains, forms.fluxes.relative, forms.fluxes.even) == (False, None, None)
+    assert (forms.retains, forms.fluxes.relative) == (False, None)
     assert not {"runoff", "flowed", "ran_off", "ponded"} & s.state.outcome.keys()
 
 

@@ -198,11 +198,9 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond, self.fall)[0]
 
     def rises(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return by how much more leaves as the cell's pressure rises; if less does, but for what weight drives."""
-        p = fluid.p[self.at]
-        k, slope, even = self.relative.through_sides(self.cells, p, self.beyond, self.fall)
-        whole = k + slope * (fluid.pi[self.at] - self.outer)
-        return self.conductance * np.where(whole > 0, whole, k + even * (p - self.beyond))
+        """Return by how much more leaves as the cell's pressure rises, never less."""
+        k, slope = self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond, self.fall)
+        return self.conductance * np.maximum(k + slope * (fluid.pi[self.at] - self.outer), 0.0)
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,10 @@ UFL = Functions(ufl.ln, ufl.exp, ufl.tanh, ufl.conditional, ufl.lt, ufl.max_valu
 
 
 class Between(NamedTuple):
-    """k_r between the two sides of a face; its slopes by both pressures, 1/Pa; these at the same share of the mean."""
+    """k_r between the two sides of a face, and its slopes by both pressures, 1/Pa."""
 
     k: Any
     slopes: tuple[Any, Any]
-    even: tuple[Any, Any]
 
 
 def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) -> Between:
@@ -80,9 +79,10 @@ def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) 
     y0, y1 = (of.where(close, 0.0, fall * (slope - sign * rate) / apart) for slope, sign in ((x0, 1), (x1, -1)))
     (both, by_both), (one, by_one), (other, by_other) = (_log_sinhc(z, of) for z in (x + y, x, y))
     factor = of.exp(both - one - other)
-    k, even = factor * mean, (factor * rise0, factor * rise1)
-    turns = (k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for dx, dy in ((x0, y0), (x1, y1)))
-    return Between(k, tuple(slope + turn for slope, turn in zip(even, turns, strict=True)), even)
+    k = factor * mean
+    turns = ((rise0, x0, y0), (rise1, x1, y1))
+    slopes = (factor * rise + k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for rise, dx, dy in turns)
+    return Between(k, tuple(slopes))
 
 
 def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
@@ -141,19 +141,18 @@ class Relative:
         p: NDArray[np.float64],
         outer: NDArray[np.float64],
         fall: NDArray[np.float64] | float = 0.0,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes, see `Between`.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes by theirs.
 
         fall (m,), Pa: what the fluid's weight drives by out of the cells.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, (slope, even) = shares[:, 0].copy(), np.zeros((2, len(p)))
+        k, slope = shares[:, 0].copy(), np.zeros(len(p))
         for law, share in zip(self._laws, shares.T[1:], strict=True):
             between = fitted((p, outer), (law(p).T, law(outer).T), fall, law.scale, NUMPY)
             k += share * between.k
             slope += share * between.slopes[0]
-            even += share * between.even[0]
-        return k, slope, even
+        return k, slope
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
         """Set the shares (n, count) of the filled owned cells."""
