@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measures of the package's house only fall: each has a ceiling, that is lowered with what it counts."""
+"""Measures of the package's house may only fall: each has a ceiling, which is lowered with its count."""
 
 import house
 import pytest

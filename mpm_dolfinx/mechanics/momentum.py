@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Balance of momentum: Q1 on the grid, integrated over the cut subdomains of the particle domains.
+"""Balance of momentum: Q1 on the grid, integrated over pieces, the parts of particle domains in cells.
 
 The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J = det F. The residual is the
 derivative of
