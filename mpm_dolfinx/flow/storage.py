@@ -514,9 +514,7 @@ class StorageProblem:
         return SAME if self.forms.retains else 1.0
 
     def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,)."""
-        if self._scale is None:
-            return dp
+        """Return by how much pressures are to fall, Pa, where pores drain and Newton's method asks for falls (n,)."""
         return restrained(self.forms.p.x.array[self.system.unknowns.owned], dp, self._scale)
 
     def settle(self) -> bool:
