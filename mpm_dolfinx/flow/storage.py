@@ -202,6 +202,8 @@ class StorageForms:
             self.fluxes.relative.set_pressures(self.p.x.array)
         self._work.x.array[:] = 0.0
         assembled.assemble_vector(self._work.x.array)
+        if self.fluxes.relative is not None and self.fluxes.relative.borders is not None:
+            self.fluxes.relative.borders.add_fluxes(self._work.x.array)
         return sum_ghosts(self._work)
 
 
@@ -277,6 +279,7 @@ class StorageSystem:
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
         self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
+        self._facets = facets
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
         pattern = self.L
@@ -316,10 +319,15 @@ class StorageSystem:
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
         """Assemble the fluxes through inner faces; off: of `AslantFlow`, where there is any."""
-        mobility = self._forms.fluxes.set_conduction(contents, flow)
+        fluxes = self._forms.fluxes
+        mobility = fluxes.set_conduction(contents, flow)
+        if fluxes.relative is not None:
+            borders = flow.mobility.borders
+            alike = self._facets if borders is None else borders.alike
+            self._flux, self.gravity = fluxes.flux.on(alike), fluxes.gravity.on(alike)
         if (relative := self._forms.fluxes.relative) is not None:
             p = self._forms.p.x.array[contents.filled]
-            mobility = mobility * relative.through_sides(contents.filled, p, p)[0][:, None]
+            mobility = mobility * relative.at(contents.filled, p)[:, None]
             flow = replace(flow, relative=relative)
         self.assemble_fluxes()
         total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # also of a cell without faces
@@ -336,6 +344,8 @@ class StorageSystem:
             relative.set_pressures(self._forms.p.x.array)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
+        if relative is not None and relative.borders is not None:
+            relative.borders.add_slopes(self.T, self.unknowns)
         self.T.assemble()
 
 
