@@ -125,7 +125,7 @@ class Borders:
         area = area * np.broadcast_to(grid.volumes(first), len(axis)) / across[0]
         two = [out.at(self._slot[0], axis, 1), out.at(self._slot[1], axis, 0)]
         weight = np.zeros(d) if flow.weight is None else flow.weight
-        return BorderFaces(laws, self._pair, area, two, lengths, apart, weight, flow.bulk)
+        return BorderFaces(laws, self._pair, area, two, lengths, apart, weight, flow.bulk, grid)
 
     def through_sides(
         self,
@@ -180,12 +180,23 @@ class BorderFaces:
     apart: list[NDArray[np.float64]]
     weight: NDArray[np.float64]
     bulk: float
+    grid: Grid
     force: NDArray[np.float64] | None = None
     """Force of inertia on the fluid (c, d), N/m^3, in the local cells, if there is any."""
+    _found_at: NDArray[np.float64] | None = None
+
+    def set_force(self, cells: NDArray[np.int64], force: NDArray[np.float64]) -> None:
+        """Set the force of inertia on the fluid (n, d), N/m^3, in the active owned cells (n,)."""
+        self.force, self._found_at = np.zeros((self.grid.num_local, self.grid.dim)), None
+        self.force[cells] = force
+        self.force = with_ghosts(self.grid, self.force)
 
     def set_pressures(self, p: NDArray[np.float64]) -> None:
         """Find the fluxes at pressures of the local cells (c,), Pa."""
         pair = p[self.pair]
+        if self._found_at is not None and np.array_equal(self._found_at, pair):
+            return
+        self._found_at = pair
         weight = self.weight if self.force is None else self.weight + self.force[self.pair].mean(axis=0)
         falls = [(way * weight).sum(axis=1) for way in self.apart]
         found: Through = through(self.laws, pair, self.ways, self.lengths, falls)

@@ -614,15 +614,17 @@ class StorageProblem:
 
     def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
-        system, fluid = self.system, self._fluid
+        system, fluid, relative = self.system, self._fluid, self.forms.fluxes.relative
+        if self._inertial is not None:
+            fluid = fluid._replace(force=self._inertial())
+            if relative is not None and relative.borders is not None:
+                relative.borders.set_force(system.unknowns.owned, fluid.force)
         if system.gravity is None:
             cells = system.between(fluid.pi) + self._aslant
         else:
             cells = self.forms.driven(system.gravity)[system.unknowns.owned] + self._aslant
         lost, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
-        if self._inertial is not None:
-            fluid = fluid._replace(force=self._inertial())
         for one, at in zip(self._feeds, outflow.at, strict=True):
             leaving = one.leaving(at, fluid)
             lost, gain = lost + leaving.cells, gain + leaving.gain
