@@ -241,6 +241,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: restless(n, material=soil(conductivity=1e-8, retention=mpm.VanGenuchten(1e6)), **HEAVY),
     ),
     "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
+    "256 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=16.0)),
 }
 QUICK = ("files of each step",)
 MAKES = [make for pair in PAIRS.values() for make in pair]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Element tests: closed forms of elastic and plastic soil, what is held stays, refusals, the command."""
+"""Element tests: closed forms of elastic and plastic soil, fixed components, refusals, the command."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A fill is put onto the present surface of what it was seeded to touch, with no gap and no overlap, at rest."""
+"""A fill is placed on the present surface of its seeded neighbours, without gap or overlap, at rest."""
 
 import numpy as np
 import pytest
@@ -138,12 +138,10 @@ def test_what_has_risen_into_a_fill_makes_it_thinner_or_is_refused_with_how_far(
     s = risen(0.3)
     s.stage(add=[1], conditions=[])
     assert s.points.volume0[-16:].sum() == pytest.approx(2 * 0.2, rel=3e-4)  # the lift gives way by 1 / 300 of a strain
-    with pytest.raises(
-        ValueError, match=r"body 1: what it was seeded to touch has moved by up to 0.45 m; to its domain"
-    ):
+    with pytest.raises(ValueError, match=r"body 1: its seeded neighbour has moved by up to 0.45 m; its domain"):
         risen(0.45).stage(add=[1])
     with pytest.raises(
-        ValueError, match=r"stage: add: body 1: body 0 has moved into it, 0.2 m deep at .*; must be seeded where"
+        ValueError, match=r"stage: add: body 1: body 0 has moved into it by 0.2 m at .*; must be seeded in space"
     ):
         risen(0.4, bottom=1.2).stage(add=[1])
 
@@ -183,7 +181,9 @@ def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
     bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
     s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, later=[1])
     s.stage(fields={"damage": np.arange(len(s.points))})
-    with pytest.raises(ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given anew"):
+    with pytest.raises(
+        ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given for all points"
+    ):
         s.stage(add=[1])
     s.stage(add=[1], fields={"damage": np.arange(sum(map(len, bodies)))})
     assert (s.points.data["damage"] == np.arange(len(s.points))).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Given displacements: on curved and slanted sides, beside walls and each other, and what is said where they fail."""
+"""Prescribed displacements: curved and slanted sides, neighbouring walls and sides, and messages of failure."""
 
 import sys
 from dataclasses import replace
@@ -124,7 +124,7 @@ def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
 
 
 def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_line_and_while_it_is_held():
-    """It carried from 1 to 1.9 times as much: the wall's nodes bear what is counted, and bend what is asked."""
+    """It carried from 1 to 1.9 times as much: wall nodes bear the counted force, and bend the prescribed field."""
     ways, lines = [(0.001, 1), (0.1, 4), (0.5, 1), (0.5, 10)], (0.5, 0.55, 0.575)
     loads = np.array([[pushed_along_a_rough_base(*way, line) for way in ways] for line in lines])
     print(f"rows: lines, columns: (ways over h, steps)\nat the end\n{loads[..., 0]}\nheld\n{loads[..., 1]}")
@@ -160,7 +160,7 @@ def test_displacements_that_differ_where_they_meet_are_refused():
 
 
 def test_a_motion_that_a_wall_forbids_is_refused():
-    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a wall holds it"):
+    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a wall .* fixes it"):
         on_top((0, 2, (0, 0.01)), side="bottom").run(1, 1)
     assert on_top((0, 2, (0, 0)), side="bottom").run(1, 1).converged
 
@@ -169,7 +169,7 @@ def test_a_side_that_something_else_holds_is_named(warned):
     s = on_top((0, 0.97, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t)))  # they share a cell, and do not meet
     s.run(1, 0.5)
     messages = warned()
-    assert messages and all("not where it is to be at [" in m and "artefact" in m for m in messages)
+    assert messages and all("not at its prescribed position at [" in m and "artefact" in m for m in messages)
     assert len(set(messages)) == 2  # each once
     on_top((0, 0.8, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t))).run(1, 0.5)
     assert not warned()
@@ -214,7 +214,7 @@ def footing_load(width):
 
 
 def test_a_held_region_may_end_anywhere_in_domains_and_cells():
-    """Lines of the points that lie on those of the grid, and that do not."""
+    """Lines of the points on the grid's lines, and off them."""
     loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
     print(f"22/9, 2.40, 2.46 wide: load / c down {loads[:, 1]}, sideways {loads[:, 0]}")
     assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)
@@ -274,5 +274,5 @@ def test_a_side_that_has_no_room_for_its_way_is_refused(bulk, shear):
     walls = {"bottom": "y", "left": "x", "right": "x"}
     bodies = [mpm.box(grid, [0, 0], [0.5, 1.0])]
     s = mpm.Simulation(grid, bodies, [soil], fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=[press])
-    with pytest.raises(mpm.GaveUp, match=r"come \d+% of the way that is given at most, must have room"):
+    with pytest.raises(mpm.GaveUp, match=r"follow at most \d+% of the prescribed increment, must be free"):
         s.run(1.0, 0.5, progress=False)

@@ -280,7 +280,9 @@ def test_a_stage_changes_what_was_given_as_a_function_of_place_only():
     s.stage(fields={"conductivity": 1e-3})
     s.run(1e4, 1e3, progress=False)
     assert s.points.pressure == pytest.approx(1e3, rel=1e-3)
-    with pytest.raises(ValueError, match="'shear': a constant of Hencky, must be given to it as a function of place"):
+    with pytest.raises(
+        ValueError, match="'shear': a constant of Hencky, must be given to it as a function of position"
+    ):
         s.stage(fields={"shear": np.full(len(s.points), 4e5)})
 
 

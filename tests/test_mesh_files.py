@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of meshes: what they say is where they say it, or it is refused in one line."""
+"""Mesh files: elements and sides are where the file has them, or the file is refused in one line."""
 
 import struct
 
@@ -93,7 +93,7 @@ def test_parts_of_an_abaqus_file_are_where_their_instances_put_them(tmp_path):
 def test_parts_without_an_assembly_are_parts_where_they_are(tmp_path):
     file = written(tmp_path, PARTS.split("*Assembly")[0])
     assert volume(file, "Soil")[0] == pytest.approx(1) and volume(file, "Wall")[0] == pytest.approx(2)
-    with pytest.raises(ValueError, match=r"scene.inp: 2 cells lie on one another, the first at \[0.5 0.5\]"):
+    with pytest.raises(ValueError, match=r"scene.inp: 2 cells overlap, the first at \[0.5 0.5\]"):
         mpm.from_mesh(GRID, file)
 
 
@@ -295,7 +295,7 @@ def in_two_pieces(folder):
 
 
 BAD = {
-    "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces of 8 cells", "4 are read"),
+    "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces of 8 cells", "meshio reads 4"),
     "a system of Nastran": (
         lambda f: written(f, BULK.replace("SYSTEM", "5"), "mesh.bdf"), "mesh: GRID in the coordinate system", "5"),
     "a file of no nodes": (lambda f: written(f, "*HEADING\n"), "mesh: has no vertices", "must have cells"),
@@ -307,13 +307,13 @@ BAD = {
     "generated nodes": (lambda f: written(f, SETS + "*NGEN\n1, 2\n"), "scene.inp: *NGEN", "one by one"),
     "cylindrical coordinates": (lambda f: written(f, SETS.replace("NSET=ALL", "SYSTEM=C")), "SYSTEM=C", "Cartesian"),
     "no type": (lambda f: written(f, SETS.replace(" TYPE=CAX4,", "")), "*ELEMENT: has no TYPE", "must"),
-    "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 is there twice", "once"),
-    "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 is there twice", "once"),
+    "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 occurs twice", "once"),
+    "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 occurs twice", "once"),
     "an unknown set": (lambda f: written(f, SETS.replace("A, b", "A, c")), "set 'C' of elements", "A, base, B"),
     "an unknown part": (lambda f: written(f, PARTS.replace("part=Wall", "part=Wa")), "*INSTANCE Wall-1", "'Wa'"),
     "nodes of two parts where they touch": (
         lambda f: written(f, PARTS.replace(" 3., 1., 0.\n 3., 1., 0., 3., 1., 1., 90.\n", " 1.,\n")),
-        "scene.inp: ", "hanging or doubled nodes, which must be merged, or be of two parts"),
+        "scene.inp: ", "hanging or duplicate nodes, must be merged, or belong to two parts"),
     "half a turn": (lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: 3 and 5", "7 of a turn"),
     "an old format of gmsh": (
         lambda f: written(f, "$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "a.msh"), "a.msh: gmsh's format 4.0", "2.2"),
@@ -328,7 +328,7 @@ def test_a_bad_file_is_refused_in_one_line(made, name, value, tmp_path):
 
 
 def test_wedges_meet_tetrahedra_and_hexahedra_face_to_face():
-    """Three unit cubes in an L: on a wedge's triangles stand tetrahedra, beside its quadrilaterals a hexahedron."""
+    """Three unit cubes in an L: tetrahedra on a wedge's triangles, and a hexahedron next to its quadrilaterals."""
     wedges, tops, cube = (box_mesh(k, (1,) * 3, low, np.add(low, 1)) for k, low in (
         ("wedge", (0, 0, 0)), ("tetra", (0, 0, 1)), ("hexahedron", (1, 0, 0))))  # fmt: skip
     x, at = np.unique(np.concatenate([m.points for m in (wedges, tops, cube)]), axis=0, return_inverse=True)
@@ -343,5 +343,5 @@ def test_wedges_meet_tetrahedra_and_hexahedra_face_to_face():
 def test_bodies_of_tetrahedra_in_one_another_are_refused_however_little():
     """Faces that are plane kites counted as warped: a tenth of an edge was let pass."""
     one, two = (mpm.from_mesh(SPACE, box_mesh("tetra", (2,) * 3, (x, 0, 0), (x + 1, 1, 1))) for x in (0, 0.99))
-    with pytest.raises(ValueError, match=r"bodies 0 and 1: both are at .* 0.01 m deep, must not lie in each other"):
+    with pytest.raises(ValueError, match=r"bodies 0 and 1: overlap at .* by 0.01 m, must not"):
         mpm.Simulation(SPACE, [one, two], [mpm.Hencky(bulk=1e6, shear=5e5)], walls={})

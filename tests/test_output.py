@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run leaves on the disk and on the terminal."""
+"""Output of a run on the disk and on the terminal."""
 
 import csv
 import importlib
@@ -29,7 +29,7 @@ from mpm_dolfinx.points.cutting import volumes
 
 
 def with_h5py():
-    """Skip where no h5py can be loaded beside dolfinx, such as PyPI's with an HDF5 of its own."""
+    """Skip without an h5py that works with dolfinx; PyPI's has its own HDF5."""
     try:
         importlib.import_module("h5py")
     except Exception as error:
@@ -180,7 +180,7 @@ def test_all_times_are_in_one_file(tmp_path, capsys):
 
 
 def test_one_file_says_what_it_cannot_do(tmp_path, monkeypatch, capsys):
-    with pytest.raises(ValueError, match=r"one_file: folder = .*: has no points\.pvd, must be that of a Writer"):
+    with pytest.raises(ValueError, match=r"one_file: folder = .*: has no points\.pvd, must be the folder of a Writer"):
         mpm.one_file(tmp_path)
     (tmp_path / "points.pvd").touch()
     monkeypatch.setitem(sys.modules, "h5py", None)
@@ -277,7 +277,7 @@ def test_a_writer_made_before_the_run_was_resumed_harms_nothing(tmp_path):
     other, probe = beam(h=0.06)
     early = mpm.Writer(other, tmp_path)
     after = mpm.resume(other, checkpoint.file)
-    with pytest.raises(ValueError, match=r"writer: made at t = 0 s for a run that goes on from t = 0\.04 s"):
+    with pytest.raises(ValueError, match=r"writer: made at t = 0 s for a run that starts at t = 0\.04 s"):
         other.run(0.06, 0.02, observe=early, after=after)
     assert list(index(tmp_path / "points.pvd")) == list(table(tmp_path / "history.csv")["t"]) == [0.0, 0.02, 0.04]
     both = r"its columns are t, .*, p_max, the run's t, .*, p_max, x_0, y_0, ux_0, uy_0, p_0;"
@@ -389,7 +389,7 @@ def test_points_are_shown_in_one_line_of_numbers():
 
 
 def test_tools_are_written_where_they_are(tmp_path):
-    """A disc that goes down, and a plate beside the grid, of which nothing is to be seen."""
+    """A disc that goes down, and a plate outside of the grid, which is not visible."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [8, 8])
     disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}

@@ -152,7 +152,7 @@ def test_a_load_comes_all_at_once_and_of_any_length_of_its_direction():
 
 @pytest.mark.parametrize("x", [1.0, 0.5])
 def test_a_rough_ball_begins_to_press_a_layer(x):
-    """The shear of what sticks pushed the surface away from it, in turns with no shear at all."""
+    """The shear of sticking cells pushed the surface away from it, alternating with no shear at all."""
     ball = mpm.Ball((x, 1.15), 0.15)
     for load in (50.0, 1e3):
         s = layer(pushed(lambda t, load=load: load * t, ball, friction=0.3))
@@ -173,7 +173,7 @@ def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
         sunk, drag = lambda t: (0, -0.02 * min(t, 1)), lambda t, most=most: most * max(0.0, t - 1)
         s = layer(mpm.Tool(block, displacement=sunk, load=drag, direction=(1, 0), friction=0.3))
         if slips:
-            with pytest.raises(mpm.GaveUp, match=r"is pushed by 1[23].* N and meets 1.* N, however far it goes"):
+            with pytest.raises(mpm.GaveUp, match=r"load 1[23].* N, but the reaction is 1.* N for any displacement"):
                 s.run(2.0, 0.25)
         else:
             s.run(2.0, 0.25)
@@ -203,7 +203,7 @@ def test_a_stage_with_new_tools_lets_go_and_one_without_goes_on():
 
 
 def test_a_load_that_meets_nothing_is_refused():
-    with pytest.raises(mpm.GaveUp, match="is pushed by 1000 N and meets nothing within a cell"):
+    with pytest.raises(mpm.GaveUp, match="load 1000 N, but there is no contact within a cell"):
         layer(pushed(1e3, mpm.Ball((1.0, 1.5), 0.3))).run(1.0, 0.5)
 
 
@@ -238,7 +238,7 @@ def test_a_load_pushes_along_the_axis_and_in_space():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"load": 1.0}, "load and direction, must be given both"),
+        ({"load": 1.0}, "load and direction, must be given together"),
         ({"load": np.nan, "direction": (0, -1)}, "load at t = 0 s = nan, must be"),
         ({"load": "1 kN", "direction": (0, -1)}, "load at t = 0 s = '1 kN', must be"),
         ({"load": lambda t: -1.0, "direction": (0, -1)}, "load at t = .* = -1, must be >= 0"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pages' code runs as it stands, they name only what exists, and their figures are those that the demos print."""
+"""The pages' code runs, all names in it exist, and the figures equal the demos' output."""
 
 import json
 import re

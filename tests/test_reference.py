@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import ufl
 from helpers import SOFT, top_load
+from test_unsaturated import WATER, Celia, Pressed, column, water
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
@@ -87,3 +88,74 @@ def test_a_modulus_that_jumps_between_cells_is_that_of_each_cell():
     column = BiotFEM([0, 0], [0.5, 1], [1, 2], law, walls=walls, conditions=[load])
     column.step(1.0)
     assert column.displacement(np.array([[0.25, 1.0]]))[0, 1] == pytest.approx(-0.5e-6 - 0.125e-6, rel=1e-6)
+
+
+def elements(cells, soil, conditions, pressure, element="q1-dg0", **options):
+    """Return a column of 1 m of elements between smooth walls, and heights of pressures in its middle."""
+    scene = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid(), "element": element, **options}
+    fem = BiotFEM([0, 0], [1 / cells, 1], (1, cells), soil, conditions=conditions, pressure=pressure, **scene)
+    return fem, (np.arange(cells) + 0.5) / cells
+
+
+def across(fem, z):
+    """Return pressures at heights z (n,), m."""
+    return fem.pressure(np.stack([0 * z + 1e-3, z], axis=1))
+
+
+@pytest.mark.parametrize("element", [pytest.param("taylor-hood", marks=pytest.mark.slow), "q1-dg0"])
+def test_unsaturated_soil_consolidates_by_elements_as_its_linear_theory_says(element):
+    """Of second order in h; beside material points on the same grid."""
+    exact, off = Pressed(), []
+    for cells in (10, 20):
+        fem, z = elements(cells, exact.soil, exact.sides, -20e3, element, numerics=mpm.Numerics(tolerance=1e-11))
+        fem.run(0.1 / exact.c, 0.01 / exact.c, probes=[[1e-3, 1.0]])
+        settled = -fem.displacement(np.array([[1e-3, 1.0]]))[0, 1]
+        off.append(abs(settled / exact.settled(0.1) - 1))
+        found = (across(fem, z) + 20e3) / (exact.load * exact.jump)
+        assert found == pytest.approx(exact.pressures(0.1, z), abs=4e-3)
+    assert off[0] < 2e-5
+    assert off[0] > 3.5 * off[1]
+    s = column(20, [exact.soil], -20e3, exact.sides, gravity=None)
+    top = mpm.probes(s.bodies, [[1e-3, 1.0]])
+    points = s.run(0.1 / exact.c, 0.01 / exact.c, progress=False, probes=top)
+    assert -points.displacement[-1, 0, 1] == pytest.approx(settled, rel=2e-5)
+
+
+def test_a_front_runs_into_dry_soil_by_elements_as_by_material_points():
+    """Of second order in h: place of -5 m after 12 h, water."""
+    known, fronts, waters = Celia(), [], []
+    for cells in (25, 50):
+        fem, z = elements(cells, known.soil, known.sides, -10 * WATER, gravity=lambda t: (0, -9.81))
+        start = fem.water()
+        fem.run(12 * 3600, 3600, probes=[[1e-3, 1.0]])
+        fronts.append(known.front(z, across(fem, z)))
+        waters.append((fem.water() - start) * cells)
+    assert fronts == pytest.approx([known.depth] * 2, abs=4e-3)
+    assert waters[1] == pytest.approx(known.taken_in, rel=2.5e-3)
+    assert abs(fronts[0] - known.depth) > 2.8 * abs(fronts[1] - known.depth)
+    assert abs(waters[0] - known.taken_in) > 3.5 * abs(waters[1] - known.taken_in)
+    s = column(25, [known.soil], -10 * WATER, known.sides, initial_stress=mpm.K0(0.5))
+    start = water(s)
+    s.run(12 * 3600, 3600, progress=False)
+    assert known.front(s.cells().x[:, 1], s.cells().pressure) == pytest.approx(fronts[0], abs=5e-3)
+    assert (water(s) - start) * 25 == pytest.approx(waters[0], rel=8e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("element", ["taylor-hood", "q1-dg0"])
+def test_soil_under_hydrostatic_suction_settles_by_elements_under_the_weight_of_its_water(element):
+    """Sealed but for its base: water is at rest, and strains are those of weight, suction and water."""
+    modulus, law = 1e8, mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
+    soil = mpm.LinearElastic(modulus / 3, modulus / 2, porosity=0.4, conductivity=1e-5, retention=law)
+    base = mpm.Drained("bottom", pressure=0.3 * WATER)
+    fem, z = elements(20, soil, [base], lambda x: WATER * (0.3 - x[:, 1]), element, gravity=lambda t: (0, -9.81))
+    fem.run(1e6, 2e5, probes=[[1e-3, 1.0]])
+    sunk = fem.displacement(np.stack([0 * z + 1e-3, z], axis=1))[:, 1]
+    assert across(fem, z) / WATER == pytest.approx(0.3 - z - sunk, abs=1e-6)
+    z = (np.arange(2000) + 0.5) / 2000
+    felt = 1 / np.sqrt(1 + (2 * np.maximum(z - 0.3, 0)) ** 2)
+    held = 0.4 * (0.1 + 0.9 * felt)
+    assert 20 * fem.water() == pytest.approx(held.mean(), rel=1e-3)
+    above = np.cumsum((9.81 * (0.6 * 2650 + 1000 * held))[::-1])[::-1] / 2000
+    settled = (above - felt * WATER * (0.3 - z)).mean() / modulus
+    assert -fem.displacement(np.array([[1e-3, 1.0]]))[0, 1] == pytest.approx(settled, rel=1e-3)

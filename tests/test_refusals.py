@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What users' functions raise or give, wrong indices, files and contradictions get one line, and nothing is lost."""
+"""Errors and values of users' functions, wrong indices, files and contradictions give one line; nothing is lost."""
 
 import resource
 import signal
@@ -215,7 +215,7 @@ CASES = {
     "a plate on two columns": (
         lambda: scene(APART, conditions=[mpm.RigidPlate("top", 1.0)]),
         "RigidPlate(side='top'",
-        "do not hang together",
+        "are not connected at one height",
     ),
     "a plate on a step": (
         lambda: scene(STEP, conditions=[mpm.RigidPlate("top", 1.0)]),
@@ -349,7 +349,7 @@ def test_a_full_disk_loses_nothing(what, tmp_path, small_disk):
     steps_so_far = s.run(0.5, 0.25, observe=observer, progress=False)
     whole = sorted(path for path in tmp_path.rglob("*") if path.is_file())
     small_disk({"points": 1000, "grid": 100_000, "checkpoint": 1000}[what])
-    with pytest.raises(OSError, match=r"(writer|checkpoint) at t = 0.75 s: .* must be .* room; the run goes on"):
+    with pytest.raises(OSError, match=r"(writer|checkpoint) at t = 0.75 s: .* free space; .* continues the run"):
         s.run(1.0, 0.25, observe=observer, progress=False, after=steps_so_far)
     assert s.t == 0.75 and all(path.exists() for path in whole)
     if what == "checkpoint":
@@ -372,7 +372,7 @@ def test_a_path_that_cannot_be_names_the_object_and_the_path(make, tmp_path):
 @pytest.mark.parametrize("body", [BODY, mpm.mapped(GRID, BODY, lambda x: 1.1 * x)], ids=["box", "mapped"])
 def test_a_body_that_is_named_twice_is_refused(body):
     check_different([body, UPPER, mpm.box(GRID, [0, 0.2], [0.5, 0.5])])  # as large and in the same place: to come later
-    with pytest.raises(ValueError, match=r"^bodies 0 and 2: are one and the same, must be two[^\n]*$"):
+    with pytest.raises(ValueError, match=r"^bodies 0 and 2: are the same object, must be two[^\n]*$"):
         check_different([body, UPPER, body])
 
 

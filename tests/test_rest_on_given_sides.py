@@ -104,7 +104,7 @@ def test_a_plate_bends_nothing_at_rest(bend):
 
 
 def test_curved_sides_that_are_held_are_at_rest():
-    """Their wet points have the pressures of their centroids from the start: else what holds would feel the change."""
+    """Their wet points have the pressures of their centroids from the start: else supports would feel the change."""
     grid = mpm.Grid([0, -1], [2, 3], [8, 16])
     body = mpm.mapped(
         grid,
@@ -128,7 +128,7 @@ def test_curved_sides_that_are_held_are_at_rest():
 
 
 def test_half_a_base_bears_all_and_what_then_loses_its_support_sinks_or_is_refused():
-    """No force but those that the scene names holds soil once a stage begins."""
+    """Only forces of the scene's conditions hold soil once a stage begins."""
     half = ([-1, -1], [1, 1])
     rests(soil(between=False, lower=0.13, given=[hold("bottom", region=half)]))
     s = soil(between=False, lower=0.13, given=[hold("bottom")])
@@ -167,6 +167,6 @@ def test_what_rests_on_springs_without_force_has_no_balance():
     def springs(u, v, points):
         return 1e9 * (points.value(u) + points.displacement)[1] * points.value(v)[1] * points.dx
 
-    with pytest.raises(ValueError, match="must be in balance with what acts at the start, and with what holds") as said:
+    with pytest.raises(ValueError, match="must be in equilibrium with loads and supports at the start") as said:
         soil(given=[], terms=[mpm.OnSide("bottom", springs)])
     assert "\n" not in str(said.value)

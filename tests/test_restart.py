@@ -88,7 +88,7 @@ def same(one, other):
 
 
 def every_step(folder):
-    """Return what saves every step in a file of its own, the first as 2."""
+    """Return an observer that saves every step in a separate file, the first as 2."""
     return lambda s: restart.save(s, folder / f"{len(s.result.t)}")
 
 
@@ -161,7 +161,7 @@ def readable(folder):
 
 @pytest.fixture(scope="module")
 def parallel(tmp_path_factory):
-    """Return the beam run by one process, and the folder of what `mpi_restart.py` leaves on two."""
+    """Return the beam run by one process, and the output folder of `mpi_restart.py` on two."""
     folder = tmp_path_factory.mktemp("parallel")
     one, probe = beam(h=0.06)
     half, end, dt = mpi_restart.T_END / 2, mpi_restart.T_END, mpi_restart.DT
@@ -238,11 +238,11 @@ def test_a_foreign_file_is_refused(checkpoint, tmp_path):
     file, simulation = tmp_path / "foreign", beam(h=0.06)[0]
     for content in (b"", b"# a mesh\n1 2 3\n" * 50, bytes(range(256)) * 10):
         file.write_bytes(content)
-        refused(file, "no checkpoint of mpm_dolfinx", simulation)
+        refused(file, "not a checkpoint of mpm_dolfinx", simulation)
     for write in (np.savez, np.save):
         with open(file, "wb") as f:
             write(f, np.arange(3))
-        refused(file, "no checkpoint of mpm_dolfinx", simulation)
+        refused(file, "not a checkpoint of mpm_dolfinx", simulation)
     with pytest.raises(FileNotFoundError):
         mpm.resume(simulation, tmp_path / "nothing")
 
@@ -305,10 +305,10 @@ def test_what_makes_no_sense_is_refused_in_one_line():
         with pytest.raises(ValueError, match="checkpoint: "):
             mpm.Checkpoint("x", **options)
     result = simulation.run(0.02, 0.02)
-    with pytest.raises(ValueError, match=r"to go on with has dt = 0\.02"):
+    with pytest.raises(ValueError, match=r"to continue has dt = 0\.02"):
         simulation.run(0.1, 0.01, after=result)
-    with pytest.raises(ValueError, match="probes: the run to go on with has 0 of them"):
+    with pytest.raises(ValueError, match="probes: the run to continue has 0 of them"):
         simulation.run(0.1, 0.02, probes=probe, after=result)
     simulation.step(0.03)
-    with pytest.raises(ValueError, match=r"to go on with has dt = 0\.02, t = 0\.02"):
+    with pytest.raises(ValueError, match=r"to continue has dt = 0\.02, t = 0\.02"):
         simulation.run(0.1, 0.02, after=result)

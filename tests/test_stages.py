@@ -79,7 +79,7 @@ def test_a_condition_that_moves_on_to_what_an_excavation_lays_bare_is_named(warn
     s = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
     s.stage(remove=remove)
     (message,) = warned()
-    assert "Traction(side='top'" in message and f"on {area:.3g} m^1 that were" in message
+    assert "Traction(side='top'" in message and f"on {area:.3g} m^1 of newly exposed faces" in message
     other = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
     other.stage(remove=remove, conditions=[replace(one) for one in load])
     assert not warned(), "they were given anew"
@@ -124,9 +124,9 @@ def test_walls_plates_and_given_displacements_come_and_go():
     "stage, message",
     [
         ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
-        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are to come later, each once"),
+        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are still to be added, each once"),
         ({"conditions": [mpm.Drained("top")]}, "need a fluid"),
-        ({"gravity": (0, -1)}, "gravity: the scene was made without"),
+        ({"gravity": (0, -1)}, "gravity: the scene has none"),
     ],
 )
 def test_what_cannot_be_is_refused(stage, message):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The factor of safety: exact for a block, limit analysis and published values for slopes; what is refused."""
+"""The factor of safety: exact for a block, limit analysis and published values for slopes; refusals."""
 
 import io
 import logging
@@ -21,7 +21,7 @@ CONE = mpm.DruckerPrager(bulk=2e8, shear=1e8, friction=PHI, dilation=PHI, cohesi
 
 
 def strength(factor):
-    """Return what a block in plane strain carries with its strength over a factor, Pa."""
+    """Return the load of a block in plane strain with its strength over a factor, Pa."""
     return 2 * C / factor * np.tan(np.pi / 4 + np.arctan(np.tan(np.radians(PHI)) / factor) / 2)
 
 
@@ -118,12 +118,12 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
         (at_rest, {"steps": 3}, "steps = 3, must be an integer >= 8"),
         (at_rest, {"dt": -1}, "dt = -1, must be > 0 and finite"),
         (at_rest, {"progress": 1}, "progress = 1, must be True or False"),
-        (lambda: block([CLAY], load=0.0), {}, "have no stress, must be at rest under what acts on them"),
+        (lambda: block([CLAY], load=0.0), {}, "have no stress, must be at rest under loads"),
         (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength / 16, must not at some factor"),
         (
             lambda: column(cells=2, material=replace(CLAY, conductivity=1e-5)),
             {},
-            "dt is not given, must be where fluid flows",
+            "dt = None: must be given where fluid flows",
         ),
         (
             lambda: column(
@@ -132,7 +132,7 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
                 material=mpm.ModifiedCamClay(M=1, lambda_=0.1, kappa=0.02, shear=1e6, initial_stress=(-1e5,) * 3),
             ),
             {},
-            "strength of ModifiedCamClay is none that can be divided, must be a law with friction",
+            "strength of ModifiedCamClay cannot be divided, must be a law with friction",
         ),
     ],
 )

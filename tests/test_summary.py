@@ -119,6 +119,7 @@ BENCHMARK = {
     "layers off the grid lines": set(),
     "grid reset in each step": {"reset of the grid"},
     "16 times the background grid": set(),
+    "256 times the background grid": set(),
 }
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Every spelling that differs between the supported dolfinx releases (0.5.2, 0.9 and 0.11).
 
-The rest of the package never asks for a version.  A branch goes when the oldest release that needs
-it goes; the branches marked OLD are those of 0.5.
+The rest of the package never asks for a version.  Branches marked OLD serve 0.5.  A branch is removed when its last
+release is no longer supported.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base._compiler import compiler
 
 OLD = not hasattr(fem, "functionspace")
-SUBDOMAIN = 1  # the one subdomain id of our measures
+SUBDOMAIN = 1  # the one subdomain id of all measures
 
 if OLD:
     from dolfinx import jit
@@ -38,16 +38,16 @@ def box_mesh(
     ranks: NDArray[np.int32],
     offsets: NDArray[np.int32],
 ) -> mesh.Mesh:
-    """Return a mesh of quadrilaterals or hexahedra, shared out as told.
+    """Return a mesh of quadrilaterals or hexahedra with a given partition.
 
     Parameters
     ----------
     cells : (n, 2^d)
-        Nodes of the cells that this process brings in, first axis fastest.
+        Nodes of the cells that this process contributes, first axis fastest.
     x : (m, d), m
-        Positions of the nodes that this process brings in; those of all processes follow each other.
+        Positions of the nodes that this process contributes.  Global node numbers follow the order of the ranks.
     ranks, offsets
-        Processes that have cell i: `ranks[offsets[i] : offsets[i + 1]]`, its owner first.
+        Ranks that hold cell i, its owner first: `ranks[offsets[i] : offsets[i + 1]]`.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
@@ -58,7 +58,7 @@ def box_mesh(
         return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
     domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
     lists = graph.adjacencylist(*where)
-    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps it, and does not unwrap what a partitioner returns
+    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap a partitioner's
     return mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=lambda *_: lists)
 
 
@@ -73,7 +73,7 @@ def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, .
 def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
     cell = msh.ufl_cell()
     if family == "DG" and cell.cellname() in ("quadrilateral", "hexahedron"):
-        family = "DQ"  # as ufl calls it there, after a line on the console
+        family = "DQ"  # ufl renames DG on boxes itself, but prints a line
     if len(shape) == 2:
         return ufl.TensorElement(family, cell, degree, shape=shape)
     if len(shape) == 1:
@@ -91,58 +91,57 @@ def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]
 
 
 def cell_dofs(V) -> NDArray[np.int32]:
-    """Return the blocked degrees of freedom of the cells, ghosts included, (cells, n)."""
+    """Return the blocked degrees of freedom (cells, n) of the cells, ghosts included."""
     dofs = V.dofmap.list
     return dofs.array.reshape(-1, V.dofmap.dof_layout.num_dofs) if OLD else np.asarray(dofs)
 
 
 def petsc_vec(u: fem.Function) -> PETSc.Vec:
-    """Return the PETSc vector that shares the function's memory."""
+    """Return the PETSc vector that shares memory with a function."""
     return u.vector if OLD else u.x.petsc_vec
 
 
 def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
-    """Return the numbers of owned cells and of all cells on this process."""
+    """Return the numbers of owned cells and of all cells, ghosts included, on this process."""
     index_map = msh.topology.index_map(msh.topology.dim)
     return index_map.size_local, index_map.size_local + index_map.num_ghosts
 
 
 def cell_kind(msh: mesh.Mesh) -> str:
-    """Return the name of the mesh's kind of cell, such as "tetrahedron"."""
+    """Return the name of the mesh's cell type, such as "tetrahedron"."""
     return msh.topology.cell_name()
 
 
 def geometry_dofs(msh: mesh.Mesh) -> NDArray[np.int32]:
-    """Return the nodes of the cells, ghosts included, (cells, n)."""
+    """Return the geometry nodes (cells, n) of the cells, ghosts included."""
     dofs = msh.geometry.dofmap
     return dofs.array.reshape(len(dofs), -1) if OLD else np.asarray(dofs)
 
 
 def scatter_reverse_add(u: fem.Function) -> None:
-    """Add the values at ghosts to those of their owners."""
+    """Add values at ghosts to the values at their owners."""
     u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)
 
 
 def seconds(task: str) -> float:
-    """Return the wall seconds that dolfinx's timers have counted for a task so far."""
+    """Return the wall time, s, that dolfinx's timers have recorded for a task."""
     try:
         total = common.timing(task)[1]
-    except RuntimeError:  # not met yet
+    except RuntimeError:  # no such task so far
         return 0.0
     return total.total_seconds() if hasattr(total, "total_seconds") else total
 
 
 class CompiledForm:
-    """A UFL form over cells or interior facets, compiled once and bound to entity lists at will.
+    """A UFL form over cells or interior facets, compiled once and bound to any list of entities.
 
-    The list may name a cell any number of times: the kernel is called once an entry.  Only owned
-    cells may be named (0.5 skips ghosts without a word).  0.5 takes the list as mesh tags with
-    repeated indices, later releases as an entity list.
+    A cell may occur several times in the list; the kernel is then called once for each entry.  Only owned cells are
+    allowed, because 0.5 silently skips ghosts.  0.5 takes the list as mesh tags, later releases as an entity list.
 
     Parameters
     ----------
     form
-        Form with one integral type, all integrals with the subdomain id `SUBDOMAIN`.
+        Form of one integral type.  All integrals have the subdomain id `SUBDOMAIN`.
     """
 
     def __init__(self, form: ufl.Form):
@@ -166,13 +165,13 @@ class CompiledForm:
 
     @property
     def form(self):
-        """The form as it was bound last."""
+        """The form with its last binding."""
         return self._last if OLD else self._last._cpp_object
 
     def bind(self, entities: NDArray[np.int32]):
-        """Set the cells (repeats allowed) or the interior facets over which the form is integrated; return it so bound.
+        """Bind the form to cells (repeats allowed) or interior facets, and return the bound form.
 
-        What is returned stays bound to them, and can be given to `assemble_vector` and `assemble_matrix`.
+        The returned form keeps its entities, and may be passed to `assemble_vector` and `assemble_matrix`.
         """
         entities = np.ascontiguousarray(entities, dtype=np.int32)
         cells = self.integral_type == "cell"
@@ -202,7 +201,7 @@ class CompiledForm:
                 {c: c for c in self._all},
                 {c: c for c in self._constants},
             )
-            self._last = bound  # keeps alive what its C++ object points to
+            self._last = bound  # keeps the data of its C++ object alive
         return self.form
 
     def packed(self, form=None) -> dict:
@@ -211,12 +210,12 @@ class CompiledForm:
         return _pack_coefficients(form) if OLD else cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b` (ghosts not accumulated), with own coefficient rows if given."""
+        """Add the vector to `b`, ghosts not summed; rows: coefficients, one row an entity, instead of dolfinx's."""
         form = form or self.form
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), self._coefficients(rows, form))
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
+        """Add the matrix to `A`, with dofs unrolled and without final assembly; rows: as for the vector."""
         form = form or self.form
         constants = cpp.fem.pack_constants(form)
         cpp.fem.petsc.assemble_matrix(A, form, constants, self._coefficients(rows, form), [], unrolled=True)
@@ -224,7 +223,7 @@ class CompiledForm:
     def _coefficients(self, rows, form) -> dict:
         if rows is None:
             return self.packed(form)
-        # 0.11 counts the integrals where earlier releases name the subdomain
+        # keys are integral numbers in 0.11, subdomain ids before
         return {(fem.IntegralType.cell, key): rows for key in self._keys}
 
     @cached_property
@@ -243,12 +242,12 @@ def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
     """Return the flat list (cell0, local facet0, cell1, local facet1, ...) of interior facets."""
     adjacency = msh.topology.connectivity(dim, dim + 1)
     cells = adjacency.array[adjacency.offsets[facets][:, None] + np.arange(2)]
-    cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # of boxes
+    cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # boxes only
     local = np.argmax(cell_facets[cells] == facets[:, None, None], axis=2)
     return np.stack([cells, local], axis=2).reshape(-1).astype(np.int32)
 
 
 def compiled(form: ufl.Form):
-    """Return `fem.form`."""
+    """Return `fem.form` of a form, made by the package's compiler."""
     with compiler(_mesh_of(form).comm):
         return fem.form(form)

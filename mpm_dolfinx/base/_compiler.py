@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The compiler behind dolfinx's forms and function spaces: quiet, with whole libraries, and errors in one line.
+"""Quiet and crash-safe compilation of dolfinx's forms and function spaces, with errors of one line.
 
-FFCx marks in its cache that a library is being made, and waits ten seconds for one that is marked.  What a run that
-was broken off leaves there ends every later run.  Here a library is made in a folder of its own and moved into the
-cache when it is whole: nothing is ever half made there.  What others have left unfinished or broken is made anew.
+FFCx marks a library in its cache before it compiles it, and waits ten seconds for a library with such a mark.  An
+aborted run leaves the mark behind, and all later runs fail.  Here each library is compiled in its own folder and
+moved into the cache when it is complete.  Incomplete or broken libraries in the cache are compiled again.
 """
 
 from __future__ import annotations
@@ -32,28 +32,27 @@ from mpm_dolfinx.base.validation import line_of
 from mpm_dolfinx.parallel.exchange import at_root, first
 
 WORKSHOP = ".mpm_dolfinx-"
-"""How the names of the folders begin in which libraries are made."""
+"""Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Seconds after which a library that another program has begun will not be finished."""
+"""Age, s, from which the mark of another program on a library counts as abandoned."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _instead: dict[Path, Path] = {}
-"""Folders of this run only, by those that cannot be written."""
+"""Temporary folders of this run, by the cache folder that cannot be written."""
 _to_say: dict[Path, str] = {}
-"""Warnings by folders of this run, until something is compiled there."""
+"""Warnings by temporary folder, until the first compilation there."""
 
 
 @contextmanager
 def compiler(comm: MPI.Intracomm) -> Iterator[None]:
-    """Let dolfinx find or compile what it needs within, on all processes of `comm`.
+    """Let dolfinx find or compile libraries within this context, on all processes of `comm`.
 
     Raises
     ------
     OSError
-        In one line, on all of them: settings that cannot be read, no folder that can be written, a C compiler that
-        fails.
+        In one line, on all processes: unreadable settings, no writable folder, or a C compiler that fails.
     """
     folder = at_root(comm, _folder)
     said = [""]
@@ -64,7 +63,7 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
             yield
     except Exception as error:
         raised = error
-    message = first(comm, said[-1])  # on several processes dolfinx tells the others only that one has failed
+    message = first(comm, said[-1])  # dolfinx tells the other processes only that one has failed
     if message:
         raise OSError(message) from raised
     if raised is not None:
@@ -75,11 +74,11 @@ MAKERS = [name for name in ("compile_forms", "compile_elements") if hasattr(libr
 
 
 def _folder() -> Path:
-    """Return the folder for libraries: dolfinx's cache, or where it cannot be written one for this run only."""
+    """Return the folder for libraries: dolfinx's cache or, if it cannot be written, a folder of this run."""
     try:
         _ffcx_settings()
         cache = _settings()["cache_dir"]
-    except (OSError, ValueError) as error:  # what is no JSON is a ValueError
+    except (OSError, ValueError) as error:  # ValueError: not JSON
         file, why = getattr(error, "filename", None), getattr(error, "strerror", None)
         what = f"{file}: {why}" if file else f"dolfinx_jit_*.json or ffcx_*.json: {line_of(error)}"
         allowed = "must be absent, or JSON that can be read: set HOME or XDG_CONFIG_HOME to another folder"
@@ -95,7 +94,7 @@ def _folder() -> Path:
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
-    """Return a new folder for libraries, which is removed at the end of the run."""
+    """Return a new folder for libraries, removed at the end of the run."""
     allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
     what = f"{cache}: {why.strerror}: dolfinx keeps there what it compiles"
     try:
@@ -108,14 +107,14 @@ def _of_this_run(cache: Path, why: OSError) -> Path:
 
 
 def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
-    """Return FFCx's maker of a library as one that finds or makes it whole.
+    """Return FFCx's function that makes a library, in a version that only leaves complete libraries behind.
 
     Parameters
     ----------
     folder
-        Where new libraries go.
+        Folder for new libraries.
     said
-        Receives what is wrong where it is not the code that is to be compiled.
+        List to which errors of compiler and disk are appended.
     """
 
     def find_or_make(*objects, cache_dir, **settings):
@@ -123,10 +122,10 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
 
         def look(name: str, names, workshop, timeout):
             for place in dict.fromkeys((Path(cache_dir), folder)):
-                with suppress(OSError, ImportError, AttributeError):  # not readable, or not what its name says
+                with suppress(OSError, ImportError, AttributeError):  # unreadable, or another file of this name
                     if _is_whole(place, name):
                         return find(name, names, place, timeout)
-            return find(name, names, workshop, timeout)  # makes the workshop, in which there is nothing
+            return find(name, names, workshop, timeout)  # makes the workshop, which is empty
 
         try:
             with _replaced(get_cached_module=look):
@@ -134,7 +133,7 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
             if workshop.exists():
                 if folder in _to_say:
                     logger.warning(_to_say.pop(folder))
-                with suppress(OSError):  # it has been loaded: who looks for it next makes it again
+                with suppress(OSError):  # the library is loaded already; a later run compiles it again
                     _publish(workshop, folder)
             return out
         except cffi.VerificationError as error:
@@ -152,46 +151,46 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
 
 
 def _library(place: Path, name: str) -> Path | None:
-    """Return the file of a library that Python would load."""
+    """Return the file of a library that Python would load, None if there is none."""
     return next(filter(Path.exists, (place / (name + suffix) for suffix in EXTENSION_SUFFIXES)), None)
 
 
 def _is_whole(place: Path, name: str) -> bool:
-    """Return whether a library is there and marked as ready, with its source by which FFCx finds it, up to its end.
+    """Return whether a library is in the cache, marked as ready, with its source, and not truncated.
 
-    The loader does not notice a library that is cut short: the run dies of a bus error when it uses what is missing.
+    The loader does not notice a truncated library: the run ends with a bus error at the first missing page.
     """
     library = _library(place, name)
     if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):
         return False
     with open(library, "rb") as f:
         head = f.read(64)
-    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not of Linux: the loader may know by itself
+    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not a Linux library: its loader may check itself
         return len(head) == 64
     (table,), (size, count) = struct.unpack_from("=Q", head, 0x28), struct.unpack_from("=2H", head, 0x3A)
-    return library.stat().st_size >= table + size * count  # the table of sections is the last that a linker writes
+    return library.stat().st_size >= table + size * count  # linkers write the section table last
 
 
 def _publish(workshop: Path, folder: Path) -> None:
-    """Move a library into the cache, if it is not there and no other program is about to put it there."""
+    """Move a library into the cache, unless it is there or another program is about to put it there."""
     (source,) = workshop.glob("*.c")
     mark, name = folder / source.name, source.stem
     ready = mark.with_suffix(".c.cached")
     try:
-        open(mark, "x").close()  # so do other programs claim a name
+        open(mark, "x").close()  # FFCx claims names in the same way
     except FileExistsError:
         if not ready.exists() and time.time() - mark.stat().st_mtime < ABANDONED:
             return
     for file in (_library(workshop, name), source, workshop / ready.name):
         os.replace(file, folder / file.name)
-    for left in folder.glob(f"{WORKSHOP}*"):  # of runs that were killed
+    for left in folder.glob(f"{WORKSHOP}*"):  # left by killed runs
         if time.time() - left.stat().st_mtime > DAY:
             shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager
 def _replaced(**functions: Callable) -> Iterator[None]:
-    """Put functions in the place of FFCx's of their names."""
+    """Replace functions of FFCx's module by others of the same names."""
     before = {name: getattr(libraries, name) for name in functions}
     for name, function in functions.items():
         setattr(libraries, name, function)
@@ -204,7 +203,7 @@ def _replaced(**functions: Callable) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep back what setuptools logs of every call of the compiler; leave logging as it was, whatever happens."""
+    """Suppress setuptools' log lines about compiler calls, and restore the root logger afterwards."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     root.addFilter(_is_wanted)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What must be there, looked at before anything of it is imported: one line says what is missing and what to do."""
+"""Check of the environment before other imports: one line names missing packages and the remedy."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 PACKAGES = {"dolfinx": "fenics-dolfinx", "scipy": "scipy", "tqdm": "tqdm", "meshio": "meshio"}
-"""Names that conda-forge has for what is to be installed; Debian's begin with python3-."""
-BROUGHT = ("mpi4py", "petsc4py", "basix", "ffcx", "ufl")  # by dolfinx
+"""Required packages and their names on conda-forge.  Debian's names begin with python3-."""
+BROUGHT = ("mpi4py", "petsc4py", "basix", "ffcx", "ufl")  # installed with dolfinx
 SUPPORTED = ((0, 5), (0, 9), (0, 10), (0, 11))
 
 
@@ -28,10 +28,10 @@ def _check() -> None:
         )
     try:
         Path.home()
-    except RuntimeError as error:  # without it Open MPI breaks down, and then dolfinx
+    except RuntimeError as error:  # Open MPI fails without HOME, and dolfinx with it
         raise ImportError("HOME is not set, dolfinx needs it: set it to a folder that can be written") from error
 
-    from mpi4py import MPI  # noqa: F401 - begins MPI, before PETSc does
+    from mpi4py import MPI  # noqa: F401 - initialises MPI before PETSc does
     from petsc4py import PETSc
 
     import numpy as np
@@ -43,9 +43,9 @@ def _check() -> None:
         )
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
-    import dolfinx  # which looks for libraries of PETSc's kind of numbers
+    import dolfinx  # looks for libraries of PETSc's scalar type
 
-    # ffcx of dolfinx 0.5 puts a handler of its own there, after which the user's `logging.basicConfig` did nothing
+    # ffcx of dolfinx 0.5 adds a root handler, which would disable the user's `logging.basicConfig`
     root.setLevel(level)
     root.handlers[:] = handlers
     if tuple(map(int, dolfinx.__version__.split(".")[:2])) not in SUPPORTED:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The one kind of cache: a value with the key that it was made for, compared by value."""
+"""The package's one kind of cache: the last value, with its key, compared by value."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ T = TypeVar("T")
 
 
 class Latest(Generic[T]):
-    """The value that was made last.
+    """Cache of the last value.
 
-    While a value is being made there is none: what breaks off in between leaves no half-made one.
+    The cache is empty while a value is made, so an exception leaves no incomplete value behind.
     """
 
     def __init__(self) -> None:
         self._entry: tuple[Any, T] | None = None
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
-        """Return the value of a key, made anew where the key is another than the last one's.
+        """Return the value of a key; a new value is made if the key differs from the last one.
 
         Parameters
         ----------
         key
-            All that the value depends on: arrays, that nobody changes, numbers, objects, or tuples of these.
+            Everything on which the value depends: numbers, objects, arrays that are never changed, or tuples of these.
         make
-            Makes the value.
+            Function that makes the value.
         comm
-            Processes that make it together: all do where one has to.
+            Processes that make the value together: if one process needs a new value, all make one.
         """
         other = self._entry is None or not same(self._entry[0], key)
         if over_all(comm, other) > 0:
@@ -45,25 +45,25 @@ class Latest(Generic[T]):
 
     @property
     def value(self) -> T | None:
-        """The value, None where there is none."""
+        """The value, None if there is none."""
         return None if self._entry is None else self._entry[1]
 
     def clear(self) -> None:
-        """Forget the value."""
+        """Remove the value."""
         self._entry = None
 
 
 class Keyed:
-    """What may be part of a key without being kept alive by it: its `key` stands for it."""
+    """Base of objects that enter cache keys by a token, `key`, so that caches do not keep them alive."""
 
     @cached_property
     def key(self) -> object:
-        """An object that nothing else has."""
+        """Token that is unique to this object."""
         return object()
 
 
 def same(a: Any, b: Any) -> bool:
-    """Return whether two keys are equal: arrays by shape and values, tuples one by one."""
+    """Return whether two keys are equal: arrays by shape and values, tuples entry by entry."""
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):

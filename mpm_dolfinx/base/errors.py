@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a step took, and the errors that end it."""
+"""Report of a step, and the errors that end a step."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import numpy as np
 
 @dataclass
 class Report:
-    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance, and mending.
+    """Report of a converged step.
 
-    rederived: domains that had folded and were re-derived from F; renewed: domains that were replaced; easy: whether
-    the next step may be longer; error, change, extremes: estimated error, and largest change, of the cells' pressures
-    in the step, and the least and the largest of them, Pa; sealed: largest change had no fluid flowed, Pa; first:
-    change in the first substep, Pa; sudden: the same where it is so fast that the step may overshoot, Pa; stress: what
-    forces of the nodes stand for, Pa; moves: estimated error of the motion, and the motion, see `motion_error`; fills:
-    estimated error of the water content, and its largest change, of pores that drain.
+    newton, coupling: iterations; history: relative residuals (momentum, storage); balance: relative error of the fluid
+    balance; rederived: inverted particle domains that were re-initialised from F; renewed: domains replaced by renewal;
+    easy: whether a longer step may converge too.  Pressures of cells, Pa: error: estimated error; change: largest
+    change in the step; extremes: minimum and maximum; sealed: largest change of the same step without flow; first:
+    largest change in the first substep; sudden: `first` if the second substep changes little more, else 0.  stress:
+    root mean square of the nodal forces over the area of a cell face, Pa; moves: estimated error of the motion, and the
+    motion, see `motion_error`; fills: estimated error and largest change of the water content, for unsaturated soil.
     """
 
     newton: int = 0
@@ -40,19 +41,19 @@ class Report:
 
 
 class StepFailed(RuntimeError):
-    """A step could not be taken; a shorter one may succeed.
+    """A step that could not be taken; a shorter step may succeed.
 
     Attributes
     ----------
     history
-        Relative residuals (momentum, storage) of its iterations, if it came to any.
+        Relative residuals (momentum, storage) of its iterations, empty if there were none.
     """
 
     history: Sequence[tuple[float, float]] = ()
 
 
 class NotConverged(StepFailed):
-    """A step's equations could not be solved; `history` lists (momentum, storage) relative residuals."""
+    """A step without a solution; `history` has its relative residuals (momentum, storage)."""
 
     def __init__(self, reason: str, history: Sequence[tuple[float, float]] = ()):
         finite = [h for h in history if np.isfinite(h).all()]
@@ -65,12 +66,12 @@ class NotConverged(StepFailed):
 
 
 class LeftGrid(StepFailed):
-    """A material point has left the grid in a step whose equations are solved.
+    """A material point outside the grid after a converged step.
 
     Attributes
     ----------
     report
-        What the step took, and the error of its pressures: a shorter one helps only where this one is too inexact.
+        Report of the step.  A shorter step helps only if the estimated error of this step is too large.
     """
 
     def __init__(self, message: str, report: Report | None = None):
@@ -79,7 +80,7 @@ class LeftGrid(StepFailed):
 
 
 def raise_interrupt(error: BaseException) -> None:
-    """Raise the KeyboardInterrupt that is behind an error: some PETSc make one of their own of it within a solver."""
+    """Raise the KeyboardInterrupt that caused an error: some PETSc releases replace it within a solver."""
     cause = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__

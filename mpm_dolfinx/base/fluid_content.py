@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""The content of pore fluid, whose change the storage balances.
+"""Fluid content of the pores, the stored quantity of the fluid balance.
 
-Per volume of the reference, d zeta = alpha dJ + S J dp.  With n = 1 - (1 - n0) / J the storage coefficient
+Per reference volume, d zeta = alpha dJ + S J dp.  With n = 1 - (1 - n0) / J the storage coefficient
 S = n / K_w + (alpha - n) / K_s makes S J = a J + b linear in J, with a = S(n = 1).  Then
 
-    d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha):
+    d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
-a mass, of a fluid of the density rho that fills J + b / a.  Divided by rho halfway between start and end, its change
-is of second order for any path, and nothing where no fluid flows, however long the step.
+The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is the
+change of this mass, divided by rho at the mean pressure of the step.  It is second-order accurate for any path, and
+zero without flow for any step size.
 
-Fluid that leaves a cell enters its neighbour with its mass.  The flow of mass, of fluid of the density rho_w
-exp(p / K_w), is -rho_w kappa grad pi with pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  Between two
-pressures the density is then the logarithmic mean (pi+ - pi-) / (p+ - p-) of both.
+Fluxes between cells conserve mass.  The mass flux of fluid of density rho_w exp(p / K_w) is -rho_w kappa grad pi with
+pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  The density between two pressures is the logarithmic mean
+(pi+ - pi-) / (p+ - p-).
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ SERIES = (120 * EPSILON) ** 0.25
 
 
 def change_of_content(alpha, a, storage, J, dp):
-    """Return the change of the content in a step as UFL, per volume at its start.
+    """Return the change of the fluid content in a step, per volume at its start, as UFL.
 
     Parameters
     ----------
     alpha, a, storage
-        Biot coefficient; storage coefficient at a porosity of one, and at the start of the step, 1/Pa.
+        Biot coefficient; storage coefficients at a porosity of one and at the start of the step, 1/Pa.
     J
-        Volume ratio since the start of the step.
+        Volume ratio of the step.
     dp
         Change of the pore pressure, Pa.
     """
@@ -43,7 +44,7 @@ def change_of_content(alpha, a, storage, J, dp):
 
 
 def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
-    """Return the same of points (n,), of arrays."""
+    """Return the same change at points, as arrays (n,)."""
     z = a * dp / (2 * alpha)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)
@@ -51,22 +52,22 @@ def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
 
 
 def mass_potential(p, bulk: float):
-    """Return pi, Pa, whose gradient drives the flow of mass, of pressures p (n,), Pa; bulk: K_w, Pa."""
+    """Return the mass potential pi (n,), Pa, of pressures p (n,), Pa; its gradient drives mass flux; bulk: K_w, Pa."""
     return p if np.isinf(bulk) else bulk * np.expm1(p / bulk)
 
 
 def pressure_of(pi, bulk: float):
-    """Return the pressures (n,), Pa, of mass potentials (n,), Pa."""
+    """Return the pressures (n,), Pa, of mass potentials (n,), Pa; bulk: K_w, Pa."""
     return pi if np.isinf(bulk) else bulk * np.log1p(pi / bulk)
 
 
 def mass_potential_form(p, compliance):
-    """Return the same as UFL; compliance: 1 / K_w, 1/Pa."""
+    """Return the mass potential, Pa, as UFL; compliance: 1 / K_w, 1/Pa."""
     return p * density_between(p, 0.0, compliance)
 
 
 def density_between(p0, p1, compliance):
-    """Return the logarithmic mean of the densities at two pressures, over that at zero pressure, as UFL."""
+    """Return the logarithmic mean of the densities at two pressures, over the density at zero pressure, as UFL."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 
@@ -80,7 +81,7 @@ def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
 
 def _sinhc(z):
     small = ufl.lt(abs(z), SERIES)
-    away = ufl.conditional(small, 1.0, z)  # both branches are evaluated, and differentiated
+    away = ufl.conditional(small, 1.0, z)  # UFL evaluates and differentiates both branches
     return ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
 
 

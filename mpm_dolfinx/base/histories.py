@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rows of histories in arrays that grow with a run, and are shared by all results of it."""
+"""Histories of a run: rows in growing arrays that all results of the run share."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 
 def _none(*shape: int) -> NDArray[np.float64]:
-    """Return an array of no numbers, that nobody changes."""
+    """Return an empty read-only array."""
     out = np.zeros(shape)
     out.flags.writeable = False
     return out
 
 
 class Row(NamedTuple):
-    """Quantities at an output time; empty arrays where nothing is asked for, or there is no fluid.
+    """Quantities at one output time.  Arrays are empty for quantities that were not requested, or without fluid.
 
-    t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure (2,): least and largest on
-    the points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, at the places of the probes, see `probe_fields`; outcome: what conditions do to the bodies, see `State`.
+    t: s; displacement, position (m, d): of the m probes, m; pressure (2,): minimum and maximum on the points, Pa;
+    probe_pressure (m,), probe_stress (m, 3, 3): pore pressure and effective stress (tension positive) at the probes,
+    Pa, see `probe_fields`; outcome: effects of the conditions on the bodies, see `State`.
     """
 
     t: float
@@ -35,11 +35,11 @@ class Row(NamedTuple):
 
 
 COLUMNS = tuple(name for name in Row._fields if name != "outcome")
-"""Names of the quantities that are arrays."""
+"""Names of the array quantities."""
 
 
 class _Columns:
-    """Arrays (room, ...) by name, and the outcomes, of which the first `used` rows are written."""
+    """Arrays (capacity, ...) by name, and the outcomes; the first `used` rows are filled."""
 
     def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
         self.arrays, self.outcomes = arrays, outcomes
@@ -49,7 +49,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, room: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Return the first rows in arrays with room for more, of these shapes a row; nan where they have none."""
+        """Return the first `count` rows in arrays of a larger capacity and these row shapes, padded with nan."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((room, *shape), np.nan)
@@ -60,15 +60,15 @@ class _Columns:
 
 
 class Rows(Sequence[Row]):
-    """Rows of the histories of a run, which nobody changes.
+    """Immutable rows of the histories of a run.
 
-    Those with one more row share the arrays of those before: it takes the time of a row, however many there are.  Where
-    rows differ in length, as from stage to stage, they are filled up with nan.
+    An extended object shares its arrays with the previous one, so the cost of a row does not depend on their number.
+    Rows of different length, as from stage to stage, are padded with nan.
 
     Attributes
     ----------
     run
-        The same for all histories that go on from the same first row.
+        Token shared by all histories that start from the same first row.
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
@@ -81,9 +81,9 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from all columns (n, ...) by name, and the outcomes (n).
+        """Return rows from all columns (n, ...) by name and the outcomes (n).
 
-        ValueError where the columns are others, or differ in length.
+        ValueError for missing or unknown columns, or different lengths.
         """
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
@@ -103,16 +103,16 @@ class Rows(Sequence[Row]):
         t, *others = (self.column(name)[k] for name in COLUMNS)
         return Row(float(t), *others, self.outcomes[k])
 
-    def __reduce__(self):  # without the room for more
+    def __reduce__(self):  # without the spare capacity
         return Rows.of_columns, ({name: self.column(name) for name in COLUMNS}, self.outcomes)
 
     @property
     def outcomes(self) -> list[Mapping[str, Mapping[str, NDArray[np.float64]]]]:
-        """What conditions did to the bodies, a copy of the list."""
+        """Effects of the conditions on the bodies, as a new list."""
         return self._columns.outcomes[: self._count]
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Return one quantity (n, ...), which cannot be written into; it is not copied."""
+        """Return one quantity (n, ...) as a read-only view."""
         if not len(self):
             return np.array([getattr(Row(0.0), name)])[:0]
         out = self._columns.arrays[name][: self._count]
@@ -120,12 +120,12 @@ class Rows(Sequence[Row]):
         return out
 
     def more(self, row: Row) -> Rows:
-        """Return these rows and another one."""
+        """Return these rows and a further one."""
         columns, n = self._columns, self._count
         values = {name: np.asarray(value, dtype=np.float64) for name, value in zip(COLUMNS, row, strict=False)}
         old = {name: rows.shape[1:] if n else values[name].shape for name, rows in columns.arrays.items()}
         shapes = {name: tuple(np.maximum(v.shape, old.get(name, v.shape))) for name, v in values.items()}
-        if columns.used != n or shapes != old:  # others have gone on in them, or there is more to be held in a row
+        if columns.used != n or shapes != old:  # another object has extended the arrays, or the row is longer
             columns = columns.reshaped(n, max(8, 2 * n), shapes)
         elif n == len(columns.arrays["t"]):
             columns.arrays = columns.reshaped(n, 2 * n, shapes).arrays

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories as tables: names and units of their columns, data frames of pandas, data sets of xarray."""
+"""Histories as tables: column names with units, pandas data frames, xarray data sets."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
-"""Components of a symmetric tensor, the first four those of plane strain."""
+"""Components of a symmetric tensor; plane strain has the first four."""
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """A row of histories, or all of them, with the times as first axis."""
+    """One row of histories, or all rows with time as the first axis."""
 
     t: Any
     displacement: NDArray[np.float64]
@@ -29,12 +29,12 @@ class Histories(Protocol):
 
 
 def components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:
-    """Return the components of symmetric tensors (..., 3, 3) that are not zero for any body, by name."""
+    """Return the components of symmetric tensors (..., 3, 3) by name, without components that vanish in the plane."""
     return {name: tensors[..., i, j] for name, (i, j) in list(SYMMETRIC.items())[: 4 if dim == 2 else 6]}
 
 
 def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
-    """Return the columns (...) of a row of histories, or of all of them, and their units, by name."""
+    """Return (values, unit) by column name, for one row of histories or all rows."""
     dim, rank = of.displacement.shape[-1], np.ndim(of.t)
     out = {"t": (of.t, "s")}
     for k, name in enumerate(("p_min", "p_max")[: of.pressure.shape[-1]]):
@@ -60,13 +60,13 @@ def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
 
 
 def _axes(dim: int, size: int) -> list[str]:
-    """Return what the components of a force are called, and of its moments if it has more than there are axes."""
+    """Return the suffixes of the components of a force, followed by moments if it has any."""
     axes = ["_x", "_y", "_z"][:dim]
     return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 
 
 def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
-    """Return the unit of an outcome, in the plane that of a slice of 1 m."""
+    """Return the unit of an outcome; in plane strain, per metre of thickness."""
     units = {"tool_travel": "m", "tool_velocity": "m/s", "outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
     units |= dict.fromkeys(("flowed", "ran_off", "ponded"), "m^3")
     whole = units.get(quantity, "N m" if moment else "N")
@@ -75,7 +75,7 @@ def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
 
 
 def data_frame(of: Histories, outcome: Outcome):
-    """Return all histories as a data frame of pandas: see `Result`."""
+    """Return all histories as a pandas data frame, see `Result`."""
     found = columns(of, outcome)
     frame = _library("pandas").DataFrame({name: values for name, (values, _) in found.items()})
     frame.attrs["units"] = {name: unit for name, (_, unit) in found.items()}
@@ -83,7 +83,7 @@ def data_frame(of: Histories, outcome: Outcome):
 
 
 def data_set(of: Histories, outcome: Outcome, about: dict[str, Any]):
-    """Return all histories as a data set of xarray: see `Result`; about: its attributes."""
+    """Return all histories as an xarray data set, see `Result`; about: its attributes."""
     dim, out = of.displacement.shape[-1], {}
     axes = list("xyz"[:dim])
     out["displacement"] = ("time", "probe", "axis"), of.displacement, "m"
@@ -112,7 +112,7 @@ def data_set(of: Histories, outcome: Outcome, about: dict[str, Any]):
 
 
 def _library(name: str) -> ModuleType:
-    """Return a library that only some need; ImportError in one line where it is not there."""
+    """Return an optional library; ImportError in one line if it is missing."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Time integration: the substeps of a step, for the material points and the finite element reference alike.
+"""Time integration: the substeps of a step, shared by the material point method and the finite element reference.
 
-The momentum has no rate.  The content zeta of a cell has: zeta' + Q(u, p) = 0.  With u, p counted from the start n,
+Momentum has no time derivative without inertia.  The fluid content zeta of a cell satisfies zeta' + Q(u, p) = 0.  With
+the subscript n at the start of a step,
 
     backward-euler   zeta(u, p) - zeta_n + dt Q(u, p) = 0,
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
-                     zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt,
+                     zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
-with gamma = 1 - 1 / sqrt(2): Alexander's method (1977), of second order and L-stable; it needs no rate at the start,
-which the remap has made noisy.  (u2, p2) is the end of the step.  After a jump of the loads one long step overshoots
-by a fifth, two halves of it do not: see `step_size`.  The rates of the two substeps tell the error of the step: see
-`solve.newton.note_pressures`.
+With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  It needs no rate at the
+start of the step, which the remap would make noisy.  (u2, p2) is the end of the step.  After a jump of the loads one
+long step overshoots by a fifth, two halves of it do not: see `step_size`.  The rates of the two substeps give the
+error estimate of the step: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ GAMMA = 1 - 1 / np.sqrt(2)  # Source: Alexander (1977), the L-stable method of t
 
 @dataclass(frozen=True)
 class Substep:
-    """A stage of a diagonally implicit Runge-Kutta method: three shares of the step.
+    """A stage of a diagonally implicit Runge-Kutta method, as fractions of the step.
 
-    end: time at which it balances; own: of the rate there; before: of the rate of the substep before.
+    end: time of its equilibrium; own: weight of its rate; before: weight of the rate of the previous substep.
     """
 
     end: float
@@ -44,12 +45,14 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement of a first substep in which what is moved as given has the velocity that it should.
+    """Return the displacement of a first substep that gives a prescribed motion its exact velocity.
 
-    The method has u = share dt v there, and from u at both substeps the velocity at the end.  With the given u itself
-    that is of first order, and accelerations of none.  v is that of the parabola through three given displacements.
+    The method implies u = share dt v in that substep, and the velocity at the end follows from both substeps.
+    Prescribed u in both substeps gives first-order velocities, and no convergence of the accelerations.  Here v is the
+    velocity of the parabola through the three displacements.
 
-    share: of the step, at which the substep ends; start, now, end: displacements at the start, there, and at the end.
+    share: end of the substep as a fraction of the step; start, now, end: displacements at the start of the step, at the
+    end of the substep and at the end of the step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 
@@ -58,12 +61,12 @@ EULER = METHODS["backward-euler"]
 
 
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:
-    """Return the substeps of a method; of a scene in which nothing has a rate, one.
+    """Return the substeps of a method; a scene without time derivatives has one.
 
     Raises
     ------
     ValueError
-        There is no such method.
+        Unknown method.
     """
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method {method!r}: must be one of {', '.join(METHODS)}")

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Values that users give, as numbers or as functions of time and place: what they may be, and how functions are called.
+"""Validation of user values, given as numbers or as functions of time and position.
 
-What is refused is refused in one line: the object, the value, and what is allowed.
+An error message has one line: the object, the value, and the allowed values.
 
 Functions are called by the names of their parameters:
 
 t
-    Time, s: the ends of the substeps, see `time_integration`.
+    Time, s, at the ends of the substeps, see `time_integration`.
 X : (m, d), m
     Reference positions of m places.
 x : (m, d), m
-    Where these are at the start of the step, as for a water level.
+    Positions of the same places at the start of the step, as for a water level.
 
-A single parameter of another name is the time.  Other names are refused.  Parameters with a default keep it.
-Constants of materials are functions of X, pressures and stresses at the start of x, the places as seeded.
+A single parameter of another name is the time.  Other names raise an error.  Parameters with defaults keep them.
+Material constants are functions of X; initial pressures and stresses are functions of x, the seeded positions.
 
-A function of places gives a number, or one for each place (m,); where vectors are allowed also one vector (d,), or one
-for each place (m, d).  Places may be repeated, so that m is above d, and no array may be two of these.
+A function of position returns a number or an array (m,); where vectors are allowed, also a vector (d,) or an array
+(m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from types import FunctionType, MethodType
 import numpy as np
 from numpy.typing import NDArray
 
-LONGEST = 160  # characters of a value that are shown
+LONGEST = 160  # characters of a value in a message
 
 
 def line(value) -> str:
-    """Return a value as it is written, in one line."""
+    """Return the representation of a value in one line."""
     return _short(repr(value))
 
 
@@ -63,22 +63,22 @@ def numbers(
     Parameters
     ----------
     name
-        Of the object, for the message.
+        Name of the object, for the message.
     shapes
-        What its shape may be, None for any; by default a number.
+        Allowed shapes, None for any shape; by default a scalar.
     allowed
-        What it must be, in words.
+        Description of the allowed values, for the message.
     test
-        Whether each number, or all of them, may be what they are.
+        Condition on each number, or on all of them together.
 
     Raises
     ------
     ValueError
-        It is not made of numbers, of another shape, or fails the test.
+        The value is not numeric, has another shape, or fails the test.
     """
     try:
         out = np.asarray(value)
-        out = None if out.dtype.kind in "USc" else out.astype(float)  # "1" is a word
+        out = None if out.dtype.kind in "USc" else out.astype(float)  # "1" is text, not a number
     except (TypeError, ValueError):
         out = None
     if out is None or not {out.shape, None}.intersection(shapes or [()]) or not np.all(test(out)):
@@ -88,25 +88,25 @@ def numbers(
 
 
 def whole(name: str, value, least: int = 1) -> int:
-    """Return an integer that is at least `least`; ValueError otherwise."""
+    """Return an integer >= `least`; ValueError otherwise."""
     allowed = f"an integer >= {least}"
     return int(numbers(name, value, allowed=allowed, test=lambda v: (least <= v) & (v < inf) & (v == np.floor(v))))
 
 
 def instance(name: str, value, kind: type) -> None:
-    """Refuse what is not an object of a kind, with a ValueError."""
+    """Raise a ValueError if a value is not an instance of a class."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} = {line(value)}, must be a {kind.__name__}")
 
 
 def flag(name: str, value) -> None:
-    """Refuse what is neither true nor false, with a ValueError."""
+    """Raise a ValueError if a value is not a boolean."""
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} = {line(value)}, must be True or False")
 
 
 def chosen(name: str, values, among: Sequence[int], what: str) -> None:
-    """Refuse what is not a list of indices among those that are allowed, each once, with a ValueError."""
+    """Raise a ValueError if values are not a list of distinct allowed indices."""
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise ValueError(f"{name} = {line(values)}, must be a list of {what}")
     for i, value in enumerate(values):
@@ -116,7 +116,7 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
 
 
 def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> None:
-    """Refuse what is not a sequence of at least so many objects of a kind, with a ValueError."""
+    """Raise a ValueError if values are not a sequence of at least `least` instances of a class."""
     kinds = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
     allowed = f"a list of {'at least one ' if least else ''}{kinds}"
     if isinstance(values, str) or not isinstance(values, Sequence) or len(values) < least:
@@ -127,7 +127,7 @@ def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> 
 
 
 def functions(name: str, values) -> None:
-    """Refuse what is not a sequence of functions, with a ValueError."""
+    """Raise a ValueError if values are not a sequence of functions."""
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise ValueError(f"{name} = {line(values)}, must be a list of functions")
     for value in values:
@@ -136,7 +136,7 @@ def functions(name: str, values) -> None:
 
 
 def asked(name: str, allowed: str, function: Callable, *values):
-    """Return what a function of the user's gives; a ValueError from what it raises, or if it cannot be called."""
+    """Return the value of a user's function; its exceptions become a ValueError that names the object."""
     try:
         return function(*values)
     except Exception as error:
@@ -144,7 +144,7 @@ def asked(name: str, allowed: str, function: Callable, *values):
 
 
 def path(name: str, value) -> Path:
-    """Return a path; ValueError if it is none."""
+    """Return a value as a path; ValueError otherwise."""
     if not isinstance(value, (str, os.PathLike)):
         raise ValueError(f"{name} = {line(value)}, must be a path")
     return Path(value)
@@ -152,7 +152,7 @@ def path(name: str, value) -> Path:
 
 @contextmanager
 def on_disk(name: str, allowed: str) -> Iterator[None]:
-    """Name the object and the remedy in an OSError: a folder that is not there, a disk that is full."""
+    """Add the object and the remedy to an OSError, such as for a missing folder or a full disk."""
     try:
         yield
     except OSError as error:
@@ -161,15 +161,15 @@ def on_disk(name: str, allowed: str) -> Iterator[None]:
 
 
 Places = Callable[[str], NDArray[np.float64]]
-"""Gives positions (m, d), m, by their name, "X" or "x"."""
+"""Function that returns positions (m, d), m, by their name, "X" or "x"."""
 PLACES = ("X", "x")
 NAMES = ("t", *PLACES)
 PLAIN = (FunctionType, MethodType)
-LIBRARIES = ("numpy", "scipy")  # x is what their functions are of, whatever that is
+LIBRARIES = ("numpy", "scipy")  # their functions name any argument x
 
 
 def _plain(function: Callable) -> bool:
-    """Return whether the parameters of a function have the names that the author of a scene has given them."""
+    """Return whether the author of the scene chose the parameter names of a function."""
     while isinstance(function, partial):
         function = function.func
     library = str(getattr(function, "__module__", None)).partition(".")[0] in LIBRARIES
@@ -178,10 +178,10 @@ def _plain(function: Callable) -> bool:
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:
-    """Return the parameters with which a function is called; None where it tells none."""
+    """Return the parameters with which a function is called; None if they are unknown."""
     try:
         every = list(signature(function).parameters.values())
-    except (TypeError, ValueError):  # some that are built in
+    except (TypeError, ValueError):  # some built-in functions
         return None
     named = [p for p in every if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     if not named and any(p.kind == p.VAR_POSITIONAL for p in every):
@@ -190,7 +190,7 @@ def _parameters(function: Callable) -> list[Parameter] | None:
 
 
 def takes(function: Callable) -> tuple[str, ...] | None:
-    """Return which of t, X and x a function is called with; None where its parameters have other names."""
+    """Return the names among t, X and x with which a function is called; None for other parameters."""
     parameters = _parameters(function)
     names = ("t",) if parameters is None else tuple(p.name for p in parameters)
     if len(names) == 1 and names[0] not in PLACES:
@@ -201,23 +201,23 @@ def takes(function: Callable) -> tuple[str, ...] | None:
 
 
 def by_place(value) -> bool:
-    """Return whether a value is a function of places."""
+    """Return whether a value is a function of position."""
     return callable(value) and bool(set(PLACES) & set(takes(value) or ()))
 
 
 def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> tuple[str, ...]:
-    """Return which of t, X and x a function is called with.
+    """Return the names among t, X and x with which a function is called.
 
     Raises
     ------
     ValueError
-        Its parameters have other names, or are not among those that are allowed.
+        The parameters have other names, or names that are not allowed here.
     """
     names = takes(function)
     if names is not None and set(names) <= set(among):
         return names
     given = ", ".join(p.name for p in _parameters(function) or ())
-    if given == "x" and "x" in among:  # an interpolation in time, say
+    if given == "x" and "x" in among:  # such as an interpolation in time
         raise ValueError(f"{what}: an object or a library's function of x, must be lambda t: ..., or lambda x: ...")
     allowed = "must be of the time alone"
     if len(among) > 1:
@@ -226,7 +226,7 @@ def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> 
 
 
 def called(function: Callable, values: dict) -> object:
-    """Return what a function gives for values of t, X and x."""
+    """Return the value of a function at given t, X and x."""
     parameters = _parameters(function)
     if parameters is None:
         return function(values["t"])
@@ -237,12 +237,12 @@ def called(function: Callable, values: dict) -> object:
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
-    """Return what a function of one kind of places gives, "X" or "x": its parameter has that name.
+    """Return the value of a function of one kind of position, "X" or "x", which its parameter must be named.
 
     Raises
     ------
     ValueError
-        It is a function of something else, or raises.
+        The function has other parameters, or raises.
     """
     names = [p.name for p in _parameters(function) or ()]
     if _plain(function) and names != [name]:
@@ -254,27 +254,29 @@ def at_places(what: str, allowed: str, function: Callable, name: str, places: ND
 def given(
     what: str, value, t: float, side: Places | None = None, dim: int = 0, *, among: Sequence[str] = NAMES, number=True
 ) -> NDArray[np.float64]:
-    """Return a value at time t (s): of shape (), or (m,) of m places; with a dimension also (d,), or (m, d).
+    """Return a value at time t: () or (m,) for m places; if `dim` > 0 also (d,) or (m, d).
 
-    A function of places that gives one vector for all gives it for each: (m, d).
+    A function of position that returns one vector gives this vector at each place, (m, d).
 
     Parameters
     ----------
     what
-        Of which object it is, for messages.
+        Name of the object, for messages.
+    t
+        Time, s.
     side
-        Gives the places; None where there are none.
+        Function that returns the places; None if there are none.
     dim
-        Number of components that it may have.
+        Number of components of a vector value, 0 if only scalars are allowed.
     among
-        Those of t, X and x of which it may be a function.
+        Allowed parameter names, among t, X and x.
     number
-        Whether it may be a number, also where it may have components.
+        Whether a scalar is allowed too.
 
     Raises
     ------
     ValueError
-        Naming what it is of, what it is, and what is allowed.
+        With the object, the value, and the allowed values.
     """
     one = [*[()] * number, *[(dim,)] * bool(dim)]
     allowed = f"a finite number{f' or {dim} of them' if dim else ''}" if number else f"{dim} finite numbers"
@@ -286,12 +288,12 @@ def given(
         allowed = f"{allowed} for a time"
         return numbers(what, asked(what, allowed, called, value, {"t": t}), *one, allowed=allowed)
     m = len(next(iter(places.values())))
-    if not m:  # a function need not have an answer for no places
+    if not m:  # a function may fail for no places
         return np.zeros(0) if number else np.zeros((0, dim))
-    again = max(dim, 1) // m + 1  # times, so that there are more places than components
+    again = max(dim, 1) // m + 1  # repetitions that make m exceed the number of components
     repeated = {name: np.tile(x, (again, 1)) for name, x in places.items()}
     many = [*[(m * again,)] * number, *[(m * again, dim)] * bool(dim)]
-    allowed = f"{allowed}, or as much for each of {m * again} places"
+    allowed = f"{allowed}, or one of these for each of {m * again} places"
     out = numbers(what, asked(what, allowed, called, value, {"t": t, **repeated}), *one, *many, allowed=allowed)
     if out.shape == (dim,):
         return np.broadcast_to(out, (m, dim))

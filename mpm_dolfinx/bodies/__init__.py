@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Bodies as they are seeded: boxes, meshes, polygons, their faces, and where they touch."""
+"""Seeded bodies: boxes, meshes, polygons, fills; their faces, and contact between seeded bodies."""

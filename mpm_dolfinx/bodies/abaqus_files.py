@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Input files of Abaqus (and CalculiX) as meshes of meshio: parts where their instances put them, sets, surfaces.
+"""Reader of Abaqus (and CalculiX) input files as meshio meshes, with placed instances, sets and surfaces.
 
-meshio's own reader keeps the last of several parts' nodes, and puts no instance in its place.
+meshio's own reader keeps only the nodes of the last part, and ignores the placement of instances.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Types of elements by their names, with their numbers of nodes, but beams, whose numbers are orders."""
+"""Element types by name, with numbers of nodes, or for beams with their order."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
-"""Beginnings of the names of elements that fill nothing."""
+"""Name prefixes of elements without volume or area."""
 KINDS = {
     **{("plane", 3): "triangle", ("plane", 4): "quad", ("plane", 6): "triangle6", ("plane", 8): "quad8"},
     **{("plane", 9): "quad9", ("solid", 4): "tetra", ("solid", 5): "pyramid", ("solid", 6): "wedge"},
@@ -38,14 +38,14 @@ FACES = {
     "wedge": ["123", "465", "1452", "2563", "3641"],
     "hexahedron": ["1234", "5876", "1562", "2673", "3784", "4851"],
 }
-"""Vertices of the faces S1, S2, ... of elements."""
+"""Vertices of the element faces S1, S2, ..."""
 MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETRIC MODEL GENERATION", "IMPORT")
-"""Keywords that make or move nodes and elements."""
+"""Keywords that generate or move nodes and elements."""
 
 
 @dataclass
 class _Set:
-    """A set of elements: its name as written, and its entries: an instance, if any, and numbers or a set's name."""
+    """A set of elements: its written name, and its entries (instance or "", numbers or name of a set)."""
 
     name: str
     internal: bool
@@ -54,9 +54,9 @@ class _Set:
 
 @dataclass
 class _Scope:
-    """What a part, or what is in none, defines; names in capitals are the keys of sets and surfaces.
+    """Definitions of a part, or outside of parts; sets and surfaces are keyed by names in capitals.
 
-    nodes : (numbers (n,), positions (n, 3)); cells : (kind, numbers (m,), numbers of nodes (m, k)); surfaces : name ->
+    nodes: (numbers (n,), positions (n, 3)); cells: (kind, numbers (m,), node numbers (m, k)); surfaces: name ->
     (instance, set or number of elements, face).
     """
 
@@ -67,14 +67,14 @@ class _Scope:
     surfaces: dict[str, tuple[str, list[tuple[str, str]]]] = field(default_factory=dict)
 
     def entry(self, options: Mapping[str, str], instance: str, rows: NDArray[np.int64] | str) -> None:
-        """Add to a set of elements."""
+        """Add an entry to a set of elements."""
         name = options["ELSET"]
         self.sets.setdefault(name.upper(), _Set(name, "INTERNAL" in options)).entries.append((instance.upper(), rows))
 
 
 @dataclass
 class _Placed:
-    """A scope in its place: of an instance, or as it is."""
+    """A scope with its placement: of an instance, or unmoved."""
 
     scope: _Scope
     name: str = ""
@@ -82,7 +82,7 @@ class _Placed:
     turn: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where positions (n, 3) of the scope are: shifted, then turned about an axis."""
+        """Return the placed positions (n, 3): translated, then rotated about an axis."""
         x = x + self.shift
         if not self.turn:
             return x
@@ -94,7 +94,7 @@ class _Placed:
 
 
 def is_abaqus(file: Path) -> bool:
-    """Return whether a file is an input file, `.inp` with keywords: AVS' files have that name too."""
+    """Return whether a file is an Abaqus input file: `.inp` with keywords, unlike AVS files of this name."""
     if file.suffix.lower() != ".inp" or not file.is_file():
         return False
     with file.open(errors="replace") as lines:
@@ -102,12 +102,12 @@ def is_abaqus(file: Path) -> bool:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of an input file: its parts are sets of elements and instances, its sides are surfaces."""
+    """Return the mesh of an input file; its parts are element sets and instances, its sides are surfaces."""
     return _assembled(_placed(file))
 
 
 def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield the keywords of a file, their options and the lines that follow; those of files it includes as well."""
+    """Yield each keyword with its options and data lines, also from included files."""
     keyword, rows = "", []
     with file.open(errors="replace") as lines:
         for line in map(str.strip, lines):
@@ -116,7 +116,7 @@ def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
             if line.startswith("*"):
                 yield from _keyword(file, keyword, rows)
                 keyword, rows = line, []
-            elif keyword.endswith(",") and not rows:  # goes on
+            elif keyword.endswith(",") and not rows:  # continuation line
                 keyword += line
             else:
                 rows.append(line)
@@ -124,7 +124,7 @@ def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
 
 
 def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield a keyword with its options and lines, or those of the file that it includes."""
+    """Yield a keyword with its options and data lines, or the keywords of an included file."""
     name, *words = line.lstrip("*").split(",")
     pairs = [word.partition("=")[::2] for word in words if word.strip()]
     options = {key.strip().upper(): value.strip().strip('"') for key, value in pairs}
@@ -140,7 +140,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return what is in no part, then the instances of parts, or, where there are none, all parts as they are."""
+    """Return the definitions outside of parts, then all instances, or all parts if there are no instances."""
     whole = _Scope()
     scope = whole
     parts = {}
@@ -172,7 +172,7 @@ def _placed(file: Path) -> list[_Placed]:
 
 
 def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str]) -> None:
-    """Add what a keyword defines to a scope: nodes, elements, sets and surfaces; others are passed over."""
+    """Add nodes, elements, sets or surfaces of a keyword to a scope; other keywords are ignored."""
     if keyword == "NODE" and rows:
         if options.get("SYSTEM", "R").upper() != "R":
             raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: must be in Cartesian coordinates")
@@ -181,7 +181,7 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
         scope.nodes.append((x[:, 0].astype(np.int64), x[:, 1:]))
     elif keyword == "ELEMENT" and rows:
         if not (kind := _kind(options["TYPE"])):
-            rows = []  # their set has no cells
+            rows = []  # elements without cells
         if not rows and "ELSET" in options:
             scope.entry(options, "", np.empty(0, np.int64))
         if not rows:
@@ -193,7 +193,7 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
                 f"*ELEMENT, TYPE={options['TYPE']}: {len(numbers)} numbers, must be {width} of each element"
             )
         table = numbers.reshape(-1, width)
-        nodes = table[:, [1, 3, 2]] if kind == "line3" else table[:, 1:]  # their second node is the middle
+        nodes = table[:, [1, 3, 2]] if kind == "line3" else table[:, 1:]  # Abaqus' second node is the middle one
         scope.cells.append((kind, table[:, 0], nodes))
         if "ELSET" in options:
             scope.entry(options, "", table[:, 0])
@@ -215,7 +215,7 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
 
 
 def _kind(name: str) -> str:
-    """Return meshio's name of a type of elements, none of those that fill nothing."""
+    """Return meshio's name of an element type, "" for elements without volume or area."""
     name = name.upper()
     if name.startswith(NO_CELL):
         return ""
@@ -235,7 +235,7 @@ def _nodes(kind: str) -> int:
 
 
 def _assembled(placed: list[_Placed]) -> meshio.Mesh:
-    """Return all that is in place as one mesh."""
+    """Return all placed scopes as one mesh."""
     x = [np.empty((0, 3))]
     cells = []
     numbers = []
@@ -247,7 +247,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
             at = np.minimum(np.searchsorted(known, rows), max(0, len(known) - 1))
             missing = rows[known[at] != rows] if len(known) else rows
             if missing.size:
-                raise ValueError(f"*ELEMENT: node {missing.flat[0]} is not there, must be one of *NODE")
+                raise ValueError(f"*ELEMENT: node {missing.flat[0]} is undefined, must be one of *NODE")
             cells.append((kind, start + where[at]))
             numbers.append((k, number))
         _once([number for of, number in numbers if of == k], "element")
@@ -262,9 +262,9 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
 def _once(
     numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return numbers of nodes or elements, ascending, and the order that makes them so.
+    """Return node or element numbers in ascending order, and the permutation.
 
-    Refuse those that are there twice, nodes only if they are at two places x (n, 3), m.
+    ValueError for a repeated number; repeated nodes must differ in position x (n, 3), m.
     """
     numbers = np.concatenate([np.empty(0, np.int64), *numbers])
     order = np.argsort(numbers, kind="stable")
@@ -273,12 +273,12 @@ def _once(
         same &= (np.diff(x[order], axis=0) != 0).any(axis=1)
     same = np.flatnonzero(same)
     if len(same):
-        raise ValueError(f"{what} {numbers[order][same[0]]} is there twice in one part, must be there once")
+        raise ValueError(f"{what} {numbers[order][same[0]]} occurs twice in one part, must occur once")
     return numbers[order], order
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return sets of elements, and surfaces, by name; facets of surfaces are put at the end of the cells."""
+    """Return element sets and surfaces by name; facets of surfaces are appended to the cells."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [
         [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed
@@ -305,7 +305,7 @@ def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list
 def _members(
     placed: list[_Placed], k: int, key: str, above: tuple[str, ...] = ()
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return the numbers of the elements of a set, each with the place that they are of."""
+    """Return the element numbers of a set, each with the index of its placed scope."""
     out = []
     if key not in placed[k].scope.sets or key in above:
         known = ", ".join(found.name for found in placed[k].scope.sets.values()) or "none"
@@ -319,7 +319,7 @@ def _members(
 
 
 def _surfaces(placed: list[_Placed], cells: list, numbers: list) -> Iterator[tuple[str, str, NDArray[np.int64]]]:
-    """Return the facets of surfaces: name, kind and nodes; those without a number are all of their elements'."""
+    """Return the facets of surfaces: name, kind and nodes; entries without a face number contain all faces."""
     out: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
     for k, one in enumerate(placed):
         for name, pairs in one.scope.surfaces.values():

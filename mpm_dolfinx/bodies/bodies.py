@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies: how they are seeded with material points."""
+"""Bodies, seeded with material points."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A body as seeded: reference geometry of all its domains, the same on every process.
+    """A seeded body: reference geometry of all its particle domains, equal on every process.
 
-    material : index in the scene's list; map : where the corners of the domains' boxes are put, see `mapped`; each kind
-    has its `spacing`, the edges of these boxes, (d,) of all alike, (n, d), or (d,) the shortest of rows, m.  What is
-    asked of all domains is made anew each time: large bodies are asked in parts.
+    material: index in the scene's list; map: map of the corners of the domains' boxes, see `mapped`.  Subclasses define
+    `spacing`, the edges of these boxes, m: (d,) for equal boxes, (n, d) in general, or (d,) with the shortest rows.
+    Arrays over all domains are not cached, so large bodies are processed in chunks.
     """
 
     material: int = 0
@@ -66,7 +66,7 @@ class Body:
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners (d,), m, of the box around the body, before the map."""
+        """Lower and upper corner (d,), m, of the bounding box before the map."""
         low, high = np.full((2, self.dim), [[np.inf], [-np.inf]])
         for part in in_chunks(len(self)):
             lower = self.lower_of(part)
@@ -85,33 +85,33 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) that have a face on a side, ascending, and the numbers (m,) of these faces."""
+        """Return the domains (m,) with a face on a side, ascending, and the numbers (m,) of these faces."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on the surface that looks towards an end of an axis, and its numbers.
+        """Return the domains (m,) with a surface face towards an end of an axis, and the numbers of these faces.
 
-        Of unstructured bodies, whose normal has its largest component there, and not below `least`.
+        In unstructured bodies the largest component of the unit normal points there, and exceeds `least`.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), ascending, of which the face at an end of an axis lies on the surface."""
+        """Return the domains (m,), ascending, with the face at an end of an axis on the surface."""
         rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return how many domains the body has across an axis, and their edge, m; means."""
+        """Return the mean number of domains across an axis, and their mean edge, m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) and numbers (m,) of all faces on the surface, by their numbers."""
+        """Return the domains (m,) and face numbers (m,) of all surface faces, sorted by face number."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains, before the map."""
         return self.lower_of(chosen)[:, None] + corner_bits(self.dim) * self.spacing
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
@@ -119,8 +119,8 @@ class Body:
         return self.images(self.reference(chosen))
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where the map puts reference positions (..., d), m."""
-        if self.map is None or not X.size:  # a map need not have an answer for no positions
+        """Return the images of reference positions (..., d), m, under the map."""
+        if self.map is None or not X.size:  # user maps may fail for no positions
             return X
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
@@ -129,9 +129,9 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return how far the middles of the domains' edges lie from the images of their middles (m,), m.
+        """Return the distances (m,), m, of the domains' edge midpoints from the mapped reference midpoints.
 
-        By so much the straight edges of two domains may differ that follow the same curve.
+        The straight edges of two domains along the same curve may differ by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:
@@ -150,11 +150,11 @@ class Body:
 
     @property
     def volume_of_boxes(self) -> float:
-        """Volume of all boxes that are alike, m^d."""
+        """Volume of all boxes, m^d, for boxes of equal size."""
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edges (m, d), m, of boxes that are as large as domains."""
+        """Return the edges (m, d), m, of boxes with the volumes of the domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -163,25 +163,24 @@ class Body:
 
 
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
-    """Bend a body: its boxes become the quadrilaterals or hexahedra between the images of their corners.
+    """Bend a body: boxes become quadrilaterals or hexahedra with mapped corners; return the bent body.
 
-    Reference positions are those before all maps: regions, probes, X of fields of materials and of displacements.
-    All else is judged after them: what touches, lies in one another, is flat, is loaded.  Sides keep their names.
-    Returns the bent body.
+    Regions, probes, and X in fields of materials and displacements remain positions before all maps.  Contact, overlap,
+    flatness and loads refer to the mapped shape.  Sides keep their names.
 
     Parameters
     ----------
     grid
         Background grid.
     body
-        Of `box`, `shape`, `from_mesh` or `polygon`, or of `mapped`: then its own map comes first.
+        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped` (whose own map is applied first).
     map
-        Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
+        Function from positions (n, d), m, to positions (n, d), m, inside the grid; smooth and orientation-preserving.
 
     Raises
     ------
     ValueError
-        The map raises, gives another shape or nan, leads out of the grid or turns a box inside out.
+        The map raises, returns another shape or nan, leaves the grid, or inverts a box.
     """
     instance("body: grid", grid, Grid)
     instance("body to bend", body, Body)
@@ -205,7 +204,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
 
 
 def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
-    """Return a body; refuse one that is not wholly in the grid.  What a map has bent has been looked at."""
+    """Return a body; ValueError if it is not inside the grid.  Mapped bodies were checked before."""
     count, where = 0, None
     for part in in_chunks(len(body) if body.map is None else 0):
         lower = body.lower_of(part) - grid.base
@@ -221,7 +220,7 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
 
 
 def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pore pressure as seeded (n,), Pa, a number or a function of places, at places x (n, d), m."""
+    """Return the seeded pore pressure (n,), Pa, a number or a function of position, at positions x (n, d), m."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
         given = at_places("pressure", allowed, pressure, "x", x)
@@ -232,7 +231,7 @@ def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.
 def material_points(
     grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
 ) -> MaterialPoints:
-    """Return this process's material points of the bodies, at rest at a pore pressure: see `pressure_at`."""
+    """Return the material points of the bodies on this process, at rest with a pore pressure, see `pressure_at`."""
     starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
     rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
     mine = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
@@ -262,11 +261,11 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (m,) whose centroids are in cells of this process, and their corners (m, 2^d, d), m."""
+    """Return the domains (m,) with centroids in cells of this process, and their corners (m, 2^d, d), m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
-        # of all copies of the grid alike
+        # the copies of the grid have equal owners
         here = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
         rows.append(part.start + here)
         corners.append(of_part[here])
@@ -274,7 +273,7 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
 
 
 def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
-    """Return how many points of bodies as seeded are in each cell of the grid (cells,)."""
+    """Return the number of seeded points of bodies in each cell of the grid (cells,)."""
     out = np.zeros(int(np.prod(grid.shape)))
     for body in bodies:
         for part in in_chunks(len(body)):
@@ -284,7 +283,7 @@ def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
 
 
 def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Refuse bodies of another dimension or outside of the grid, and a list that names one twice."""
+    """Raise an error for bodies of another dimension, bodies outside the grid, and repeated bodies."""
     check_different(bodies)
     for i, body in enumerate(bodies):
         if body.dim != grid.dim:
@@ -293,8 +292,8 @@ def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def check_different(bodies: Sequence[Body]) -> None:
-    """Refuse a list that names a body twice: conditions would count its faces twice and act on one of the two."""
+    """Raise an error for a repeated body, because conditions would count its faces twice but act on one copy."""
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:
-                raise ValueError(f"bodies {i} and {j}: are one and the same, must be two; seed the second one anew")
+                raise ValueError(f"bodies {i} and {j}: are the same object, must be two; seed the second one too")

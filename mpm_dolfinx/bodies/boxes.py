@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies whose domains are boxes of a lattice: known by a few numbers, whatever their size."""
+"""Bodies of boxes on a regular lattice, stored as a few numbers for any size."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticeBody(Body):
-    """A body whose domains are boxes of a lattice, all of them or some.
+    """A body of all or some boxes of a lattice.
 
-    origin, spacing, count : (d,) — where the lattice begins, m, edges of its boxes, m, their number along each axis;
-    filled : (n,) — lexicographic numbers of those that the body has, ascending; None: all.
+    origin, spacing (d,): lower corner of the lattice and edges of its boxes, m; count: number of boxes along each axis;
+    filled (n,): ascending lexicographic numbers of the boxes of the body; None: all.
     """
 
     origin: NDArray[np.float64]
@@ -67,7 +67,7 @@ class LatticeBody(Body):
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), ascending, of which the face at an end of an axis lies on the surface."""
+        """Return the domains (m,), ascending, with the face at an end of an axis on the surface."""
         if self.filled is not None:
             return super()._with_face(axis, end)
         along = [np.arange(n) for n in self.count]
@@ -84,27 +84,27 @@ class LatticeBody(Body):
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners (d,), m, of the box around the body, before the map."""
+        """Lower and upper corner (d,), m, of the bounding box before the map."""
         low, high = (self.origin + index * self.spacing for index in self._ends)
         return low, high + self.spacing
 
     @property
     def lattice(self) -> tuple[int, ...]:
-        """Domains along the axes of the lattice that they lie on, some of which may be empty."""
+        """Extent of the body in domains along each axis of the lattice; some of these may be empty."""
         low, high = self._ends
         return tuple(high - low + 1)
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several; lexicographic."""
+        """Return lexicographic numbers (m, 2^d) of the corners of domains; shared corners have one number."""
         corners = (self._index(rows) - self._ends[0])[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body whose domains are boxes of a lattice with rows of many widths.
+    """A body of boxes on a lattice with rows of different widths.
 
-    rows : (count + 1,) along each axis, m — where they begin and end; spacing : (d,) — the narrowest ones.
+    rows: boundaries (count + 1,) of the rows along each axis, m; spacing (d,): narrowest rows, m.
     """
 
     rows: tuple[NDArray[np.float64], ...]
@@ -127,17 +127,17 @@ class RowsBody(LatticeBody):
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains, before the map."""
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return how many domains the body has across an axis, and their edge, m; means."""
+        """Return the mean number of domains across an axis, and their mean edge, m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners (d,), m, of the box around the body, before the map."""
+        """Lower and upper corner (d,), m, of the bounding box before the map."""
         low, high = self._ends
         return self._at(low), self._at(high + 1)
 
@@ -147,13 +147,13 @@ class RowsBody(LatticeBody):
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
-        """Return the places (n,), m, along an axis of the corners of `lattice`."""
+        """Return the coordinates (n,), m, of the rows' boundaries along an axis, within the body."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return where rows of domains begin and end from low to high, m: so many a cell, and as many in parts of cells."""
+    """Return the boundaries of rows from low to high, m: `per_cell` rows a cell, and a share of it in cut cells."""
     lines = grid.lines[axis] + grid.base[axis]
     apart = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + apart) & (lines < high - apart)], [high]])
@@ -179,16 +179,15 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     lower, upper : (d,), m
         Corners of the box, inside the grid; they need not lie on grid lines.
     per_cell
-        Points per cell and direction (rounded so that they fit the box), >= 1; in cells of many sizes rows of points
-        begin and end at grid lines.  With 1, bodies of a few cells'
-        thickness bend too easily (a warning says so), and the error is about ten times that of 2.
+        Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, rows of points end at
+        grid lines.  A value of 1 makes thin bodies too flexible (with a warning), and errors ten times as large as 2.
     material
         Index of the material in the scene's list, >= 0.
 
     Raises
     ------
     ValueError
-        A corner outside the grid, upper not above lower, or per_cell or material that is no such integer.
+        A corner outside the grid, upper not above lower, or invalid per_cell or material.
     """
     instance("body: grid", grid, Grid)
     lower, upper = (
@@ -209,16 +208,16 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed the points of the grid's own lattice whose centres are inside a shape; return the body.
+    """Seed the points of the grid's own lattice with centres inside a shape; return the body.
 
-    Its surface is made of steps of a point's size: for smooth sides take `mapped`.
+    Its surface consists of steps of the size of a domain; `mapped` gives smooth sides.
 
     Parameters
     ----------
     grid
         Background grid.
     inside
-        Maps positions (n, d), m, to booleans (n,).
+        Function from positions (n, d), m, to booleans (n,).
     per_cell
         Points per cell and direction, >= 1.
     material
@@ -227,7 +226,7 @@ def shape(
     Raises
     ------
     ValueError
-        `inside` raises, gives no booleans or holds nowhere; per_cell or material that is no such integer.
+        `inside` raises, returns no booleans or is False everywhere; or invalid per_cell or material.
     """
     instance("body: grid", grid, Grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
@@ -241,10 +240,10 @@ def shape(
         rows = [_rows(grid, a, grid.lower[a], grid.upper[a], per_cell) for a in range(grid.dim)]
         x = np.stack([((r[1:] + r[:-1]) / 2)[i] for r, i in zip(rows, index.T, strict=True)], axis=1)
     filled = np.asarray(asked("body: inside(x)", allowed, inside, x))
-    if filled.shape != (len(index),) or filled.dtype != bool:  # a distance is neither inside nor outside
+    if filled.shape != (len(index),) or filled.dtype != bool:  # such as a signed distance
         raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     if not filled.any():
-        raise ValueError("body: inside(x) holds at no point of the grid, must hold at one; the body fits in no cell")
+        raise ValueError("body: inside(x) is False at all points, must be True at one: is it below a cell in size?")
     numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
     if not grid.even:
         return check_inside(grid, _lattice(rows, filled=numbers_of, material=material))

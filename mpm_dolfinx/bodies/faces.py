@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface of the bodies."""
+"""Surface of the bodies: faces on sides, without parts in contact with other bodies, limited to regions."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from mpm_dolfinx.grid.grid import rounding
 from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACES, corner_bits
 
 TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(d)]) for d in (2, 3)}
-"""Axes (d, d-1) along the faces of a domain that are across each axis."""
+"""Tangential axes (d, d-1) of the faces normal to each axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
+    """Faces of domains on one side of the bodies, equal on every process; arrays over m rows.
 
-    A face of which several parts count has a row for each.
+    A face with several free parts has a row for each part.
 
-    id : (m,) number of the point, ascending; face : (m,) number of the face in its domain, see `cutting.FACES`;
-    xi : (m, 2^(d-1), d) corners of the part of the face that counts, in the domain's coordinates from -1 to 1, of a
-    triangle the last one twice; domain, before : (m, 2^d, d) corners of the domain as seeded, after all maps and before
-    them (reference positions), m; region : (2, d) box of reference positions to which the faces are limited, m.
+    id: (m,) number of the point, ascending; face: (m,) number of the face in its domain, see `cutting.FACES`; xi:
+    (m, 2^(d-1), d) corners of the free part in the local coordinates of the domain, in [-1, 1], a triangle repeats its
+    last one; domain, before: (m, 2^d, d) seeded corners of the domain after all maps, and before them (reference
+    positions), m; region: (2, d) box of reference positions that limits the faces, m.
     """
 
     id: NDArray[np.int64]
@@ -56,7 +56,7 @@ class Surface:
         return len(self.id)
 
     def off_axis(self) -> Surface:
-        """Return the faces but for those that lie on the axis of revolution, where they have no area."""
+        """Return the faces without faces on the axis of revolution, which have no area."""
         off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self
@@ -65,17 +65,17 @@ class Surface:
 
     @cached_property
     def outward(self) -> NDArray[np.float64]:
-        """Outward area vectors (m, d) of the whole faces as seeded, m^(d-1)."""
+        """Seeded outward area vectors (m, d) of whole faces, m^(d-1)."""
         return face_vectors(self.domain, self.face)
 
     @cached_property
     def whole0(self) -> NDArray[np.float64]:
-        """Area (m,) of the whole faces as seeded, m^(d-1)."""
+        """Seeded areas (m,) of whole faces, m^(d-1)."""
         return np.linalg.norm(self.outward, axis=1)
 
     @cached_property
     def area0(self) -> NDArray[np.float64]:
-        """Area (m,) of the parts that count as seeded, m^(d-1)."""
+        """Seeded areas (m,) of the free parts, m^(d-1)."""
         x = self.places()
         if x.shape[2] == 2:
             return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
@@ -83,29 +83,29 @@ class Surface:
 
     @cached_property
     def skew(self) -> NDArray[np.bool_]:
-        """Which faces (m,) are no parallelograms as seeded."""
+        """Which seeded faces (m,) are not parallelograms."""
         x = np.take_along_axis(self.domain, FACES[self.xi.shape[2]][self.face][:, :, None], axis=1)
         off = np.linalg.norm(x[:, -1] - x[:, 1] - x[:, -2] + x[:, 0], axis=1) if x.shape[2] == 3 else np.zeros(len(x))
         return off > SAME * np.ptp(x, axis=1).max(axis=1)
 
     def places(self) -> NDArray[np.float64]:
-        """Return where the corners of the parts (m, 2^(d-1), d) are as seeded, m."""
+        """Return the seeded positions (m, 2^(d-1), d), m, of the corners of the free parts."""
         domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
+        """Return the reference positions (n, d), m, of local coordinates xi (n, d) on faces."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """Reference positions (m, 2^(d-1), d) of the corners of the parts, m."""
+        """Reference positions (m, 2^(d-1), d), m, of the corners of the free parts."""
         at = np.repeat(np.arange(len(self)), self.xi.shape[1])
         return self.reference(at, self.xi.reshape(len(at), self.xi.shape[2])).reshape(self.xi.shape)
 
     @property
     def X(self) -> NDArray[np.float64]:
-        """Boxes (m, 2, d) around the parts in reference positions, m."""
+        """Bounding boxes (m, 2, d), m, of the free parts in reference positions."""
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
 
 
@@ -113,33 +113,32 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the corners (2, d) of a region, m; without one, of all space.
+    """Return the corners (2, d) of a region, m; infinite without a region.
 
-    Equal regions have equal bytes (`tobytes`), however they are given: by these they are compared.
+    Equal regions have equal bytes (`tobytes`), which serve as a key.
     """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
     allowed = f"two corners of {dim} coordinates each, the lower first"
     corners = numbers("region", region, (2, dim), allowed=allowed, test=lambda x: x[0] <= x[1])
-    return np.ascontiguousarray(corners) + 0.0  # no -0
+    return np.ascontiguousarray(corners) + 0.0  # no -0.0
 
 
 def surface(
     bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the faces on a named side of the bodies that are present, but for what of them lies on another body.
+    """Return the faces on a side of the present bodies, without parts in contact with other bodies.
 
-    Bodies lie on one another as they are seeded, after their maps, and from then on: bodies that touch stick.
+    Contact is that of the seeded bodies, after their maps.  It is permanent, because bodies in contact stick.
 
     Parameters
     ----------
     name
-        Side: of lattices "left", "right", "bottom", "top", in 3D also "front", "back"; of meshes as these name it.
-        None: all sides.
+        Side: "left", "right", "bottom", "top", in 3D also "front", "back", or a name from a mesh.  None: all sides.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the faces; faces partly in it count with that part.
+        Box of reference positions that limits the faces; a face partly inside counts with that part.
     present
-        Which bodies are there, by default all.
+        Which bodies are present, by default all.
     """
     there = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
@@ -162,7 +161,7 @@ def surface(
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
-    """Return the faces of several surfaces, of other bodies each, as one."""
+    """Return the faces of several surfaces of different bodies as one surface."""
     names = [f.name for f in fields(Surface) if f.name != "region"]
     rows = {name: np.concatenate([getattr(one, name) for one in surfaces]) for name in names}
     order = np.argsort(rows["id"], kind="stable")
@@ -177,11 +176,11 @@ def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -
 def _in_region(
     body: Body, row: NDArray[np.int64], face: NDArray[np.int64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return those of a body's faces that may have a part in a box (2, d) of all space."""
+    """Return the faces of a body that may intersect a box (2, d) of reference positions."""
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # slivers are none: their domains would count as held
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # ignores slivers, which would prescribe whole domains
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)
@@ -196,16 +195,16 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return what of parts t (n, 4, 2) of faces part (n,) lies in a region: their faces (m,), and xi as of a `Surface`.
+    """Return parts t (n, 4, 2) of faces part (n,), limited to a region: their faces (m,), and xi as in `Surface`.
 
-    row, face (k,): domains, and numbers in them, of all faces.
+    row, face (k,): domains and face numbers of all faces.
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
     bent = np.zeros(len(X), dtype=bool)
     clipped = np.empty((0, 3, 2))
     of = np.empty(0, np.int64)
-    if dim == 3 and body.lattice is None:  # faces that are not whole, and no rectangles along the axes
+    if dim == 3 and body.lattice is None:  # partial faces that are not rectangles along the axes
         bent = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1) & ~_along_axes(X)
         clipped, of = _clipped(X[bent], t[bent], region)
     quad, three = np.flatnonzero(~bent & ~three), np.flatnonzero(~bent & three)
@@ -226,20 +225,20 @@ def _limited(
 
 
 def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which faces (n,), of corners (n, 4, 3), m, are rectangles with edges along the axes."""
+    """Return which faces (n,) with corners (n, 4, 3), m, are rectangles with edges along the axes."""
     edges = X[:, [1, 2, 3, 3]] - X[:, [0, 0, 2, 1]]
     return ((np.abs(edges) > rounding(X)).sum(axis=2) == 1).all(axis=1)
 
 
 def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return from where to where (n, 2), in the coordinates of faces, these lie in a region.
+    """Return the intervals (n, 2) of faces in a region, in the coordinates of the faces.
 
-    X (n, 2^(d-1), d), m: reference positions of the corners of edges, or of rectangles along the axes.
+    X (n, 2^(d-1), d), m: reference corners of edges, or of rectangles along the axes.
     """
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
         way = X[:, 1 << k] - X[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):  # along an axis that does not limit them
+        with np.errstate(divide="ignore", invalid="ignore"):  # edges across an axis have no limit along it
             ends = np.where(np.abs(way) > rounding(X), (region[:, None] - X[:, 0]) / way, [[[-np.inf]], [[np.inf]]])
         low[:, k] = np.maximum(0.0, ends.min(axis=0).max(axis=1))
         high[:, k] = np.minimum(1.0, ends.max(axis=0).min(axis=1))
@@ -249,9 +248,9 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return what lies in a region of parts t (n, 4, 2) of faces X (n, 4, 3): triangles, and the parts they are of."""
+    """Return parts t (n, 4, 2) of faces X (n, 4, 3), clipped to a region: triangles, and the index of the part."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
-    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # triangles, about a corner
+    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # triangles use a corner as their middle
     middle = np.where(three, places[:, 2], places.mean(axis=1))
     places = np.concatenate([places, middle[:, None]], axis=1)
     s = np.concatenate([places[:, list(triangle)].transpose(1, 2, 0) for triangle in ABOUT_MIDDLE], axis=2)
@@ -265,9 +264,9 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces: the face (n,) of each, and its corners (n, 4, 2), from 0 to 1 over the face.
+    """Return the free parts of faces: the face (n,) of each, and its corners (n, 4, 2) in [0, 1] over the face.
 
-    They are rectangles where boxes lie along the face's edges, else triangles, whose last corner comes twice.
+    Parts are rectangles if covering boxes lie along the edges of the face, else triangles with a repeated last corner.
     """
     on = [covers(own, other) for other in others]
     if not on:
@@ -284,7 +283,7 @@ def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArr
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions (m, d) in domains (m, 2^d, d) at local coordinates (m, d) from -1 to 1."""
+    """Return the positions (m, d) in domains (m, 2^d, d) at local coordinates (m, d) in [-1, 1]."""
     signs = 2 * corner_bits(xi.shape[1]) - 1
     N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
     return np.einsum("mk,mkd->md", N, corners)
@@ -293,7 +292,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return coordinates xi (n, 3) in domains (n, 8, 3) with those along faces (n,) put to places x (n, 3) on these."""
+    """Return coordinates xi (n, 3) in domains (n, 8, 3), moved along faces (n,) to positions x (n, 3) on them."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

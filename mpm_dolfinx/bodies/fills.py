@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies that come later are put onto the present surface of those that they were seeded to touch."""
+"""Placement of bodies that are added later onto the present surface of their seeded neighbours."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-MISFIT = 0.01  # cells: fills whose straight edges are further off a bent surface are named in a warning
-UPRIGHT = 0.95  # cosine: what of a mesh looks that straight away from what it lies on stays where it was seeded
-INSIDE = 0.05  # of a domain's shortest edge: what lies deeper in a fill is in its way
+MISFIT = 0.01  # cells: distance of a fill's straight edges from a bent surface above which a warning is issued
+UPRIGHT = 0.95  # cosine: faces of a mesh opposite to the contact, up to this angle, keep their seeded place
+INSIDE = 0.05  # of a domain's shortest edge: deeper penetration into a fill is an error
 
 
 @dataclass
 class Contact:
-    """Where a side of a fill lies on a body, as seeded; n pairs of faces.
+    """Seeded contact between a side of a fill and a body; n pairs of faces.
 
-    side : (axis, end) of the fill; own, other: faces of both; cover: which lie on which; moved : (n, 4, d), m, how far
-    the corners of the body's faces have moved since they were seeded.
+    side: (axis, end) of the fill; own, other: faces of both; cover: pairs of faces in contact; moved (n, 4, d):
+    displacement of the corners of the body's faces since seeding, m.
     """
 
     side: tuple[int, int]
@@ -42,23 +42,23 @@ class Contact:
     moved: NDArray[np.float64]
 
     def area(self) -> float:
-        """Return how large it is, m^(d-1)."""
+        """Return the contact area, m^(d-1)."""
         return float(covered(len(self.own.row), self.cover) @ np.linalg.norm(self.own.outward, axis=1))
 
     def corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return domains (n, 1) of the fill, and which of their corners (n, 4) the paired faces have."""
+        """Return the domains (n, 1) of the fill, and the corner indices (n, 4) of the paired faces."""
         face = self.cover.face
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill's faces lie on the paired one, and its way there (n, 4, d), m."""
+        """Return which corners (n, 4) of the fill's faces lie on the paired face, and its displacement (n, 4, d)."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return how far corners of the body come to lie off the fill, m, if its domains' corners move by u."""
+        """Return the largest distance, m, of the body's corners from the fill, if the fill's corners move by u."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -66,7 +66,7 @@ class Contact:
 
 
 def touches(bodies: Sequence[Body], there: Sequence[int], fill: int) -> bool:
-    """Whether a fill as seeded touches one of the bodies that are there."""
+    """Return whether a seeded fill touches one of the present bodies."""
     own = Faces.around(bodies[fill])
     return any(len(covers(own, Faces.around(bodies[other])).face) for other in there)
 
@@ -74,22 +74,22 @@ def touches(bodies: Sequence[Body], there: Sequence[int], fill: int) -> bool:
 def put(
     grid: Grid, bodies: Sequence[Body], there: Sequence[int], fill: int, points: MaterialPoints, new: MaterialPoints
 ) -> MaterialPoints:
-    """Return the points of a fill put onto the bodies that are there.
+    """Return the points of a fill, placed onto the present bodies.
 
-    Its sides that touch bodies as seeded follow these, the side opposite to the largest contact stays where it was
-    seeded, and what lies between follows evenly: at rest, its domains have the places and volumes that are left to it.
+    Sides in seeded contact follow the neighbours.  The side opposite to the largest contact keeps its seeded place.
+    The interior is interpolated.  The fill is at rest, and its domains have the volumes of this shape.
 
     Parameters
     ----------
     bodies, there, fill
-        All bodies, which of them are there, and which one comes.
+        All bodies, indices of the present ones, and index of the fill.
     points, new
-        This process's points of those that are there, and of the fill as seeded.
+        Points of the present bodies, and of the seeded fill, on this process.
 
     Raises
     ------
     ValueError
-        What is there has moved into the fill; the message says where and how far.
+        A present body has moved into the fill; with place and depth.
     """
     body = bodies[fill]
     corners = bodies[fill].corners() - grid.base
@@ -103,12 +103,12 @@ def put(
         corners = corners + u
     if misfit > MISFIT * grid.least:
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
-        warn(grid.comm, ResolutionWarning, what + "; seed it with the spacing of what it lies on", fill, misfit)
+        warn(grid.comm, ResolutionWarning, what + "; seed it with the spacing of the body below", fill, misfit)
     for other, touching in found.items():
         depth, gap, x = _room(grid, bodies, other, corners, points, misfit)
         if depth:
-            what = f"stage: add: body {fill}: body {other} has moved into it, {depth:.3g} m deep at {x + grid.base}"
-            raise ValueError(f"{what}; must be seeded where nothing is by now")
+            what = f"stage: add: body {fill}: body {other} has moved into it by {depth:.3g} m at {x + grid.base}"
+            raise ValueError(f"{what}; must be seeded in space that is free now")
         together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
         if together and not touching:
             warn_near(grid, f"bodies {other} and {fill}", gap, x + grid.base)
@@ -125,7 +125,7 @@ def _start(bodies: Sequence[Body], body: int) -> int:
 
 
 def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points: MaterialPoints) -> list[Contact]:
-    """Return where a fill lies on a body."""
+    """Return the contacts between a fill and a body."""
     around, out = Faces.around(bodies[other]), []
     for axis in range(grid.dim):
         for end in (0, 1):
@@ -143,7 +143,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Return the displacement (n, 2^d, d), m, of the corners of a fill that follows what it lies on."""
+    """Return the displacements (n, 2^d, d), m, of the corners of a fill that follows its neighbours."""
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
@@ -162,7 +162,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # along a wall it only slides
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # slides along walls
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))
@@ -170,7 +170,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
 
 
 def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
-    """Return the matrix (count, count) of springs along the edges of a body's domains."""
+    """Return the stiffness matrix (count, count) of springs along the edges of a body's domains."""
     X, ends = body.reference(), [(FACES[body.dim][2 * axis], FACES[body.dim][2 * axis + 1]) for axis in range(body.dim)]
     a, b = (np.concatenate([node[:, pair[k]].ravel() for pair in ends]) for k in (0, 1))
     length = np.concatenate([((X[:, f] - X[:, g]) ** 2).sum(axis=2).ravel() for f, g in ends])
@@ -180,14 +180,14 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements (n,) along an axis, those that are fixed and the others in balance with them."""
+    """Return displacements (n,) along an axis: the fixed ones, and the others in equilibrium with them."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
         rows = K[free]
         A = rows[:, free].tocsr()
         csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
-        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # all processes have all seeded bodies
+        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # all processes hold all seeded bodies
         solver = PETSc.KSP().create(MPI.COMM_SELF)
         solver.setErrorIfNotConverged(True)
         solver.setOperators(matrix)
@@ -204,16 +204,16 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
 
 
 def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray) -> None:
-    """Refuse a fill of which next to nothing is left, or that leaves the grid."""
+    """Raise an error if a domain of the fill has nearly no volume, or leaves the grid."""
     now = corners + u
     ratio = volumes(now) / volumes(corners)
     k = int(np.argmin(ratio))
     far = np.linalg.norm(u, axis=2).max()
-    name = f"stage: add: body {fill}: what it was seeded to touch has moved by up to {far:.3g} m"
+    name = f"stage: add: body {fill}: its seeded neighbour has moved by up to {far:.3g} m"
     if ratio[k] < TANGLED:
         raise ValueError(
-            f"{name}; to its domain at {corners[k].mean(axis=0) + grid.base} it leaves {ratio[k]:.2g} of the volume, "
-            f"must leave {TANGLED}"
+            f"{name}; its domain at {corners[k].mean(axis=0) + grid.base} keeps {ratio[k]:.2g} of the volume, "
+            f"must keep {TANGLED}"
         )
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):
@@ -224,7 +224,7 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
 def _room(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return how deep a body lies in a fill's domains now, m, else how many cells it is apart, and where."""
+    """Return the penetration of a body into a fill's domains, m, their gap in cells, and the place."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]

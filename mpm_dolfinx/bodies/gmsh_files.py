@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Files of gmsh in its format 4.1 as meshes of meshio, with all physical groups of each entity.
+"""Reader of gmsh files of format 4.1 as meshio meshes, with all physical groups of each entity.
 
-meshio's own reader keeps the first group of an entity, and reads no file in which some entities have none.
+meshio's own reader keeps only the first group of an entity, and fails for files with ungrouped entities.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""meshio's names of gmsh's types of elements, and their numbers of nodes; of second order gmsh's order of edges."""
+"""meshio's names of gmsh's element types, and numbers of nodes; second-order types in gmsh's order of edges."""
 
 
 class _Numbers:
-    """The numbers of a section, one after the other."""
+    """Sequential reader of the numbers in a section."""
 
     def __init__(self, section: bytes, binary: bool):
         self._binary = binary
@@ -44,7 +44,7 @@ class _Numbers:
 
 
 def version(file: Path) -> str:
-    """Return the version of gmsh's format that a file has, none of one that is not gmsh's."""
+    """Return the version of gmsh's format of a file, "" for other files."""
     if not file.is_file():
         return ""
     with file.open("rb") as opened:
@@ -53,12 +53,12 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1: its physical groups are sets of cells by number, names field data."""
+    """Return the mesh of a file of format 4.1; physical groups become cell sets by number, their names field data."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"
     if binary and b"\n\x01\0\0\0" not in _section(data, "MeshFormat"):
-        raise ValueError("numbers in another order of bytes, must be those of this machine")
+        raise ValueError("another byte order, must be that of this machine")
     if binary and size != b"8":
         raise ValueError(f"numbers of {size.decode()} bytes, must be of 8")
     groups = dict(_groups(_Numbers(_section(data, "Entities"), binary))) if b"$Entities" in data else {}
@@ -84,7 +84,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _section(data: bytes, name: str) -> bytes:
-    """Return what stands between the lines of a section's name and of its end."""
+    """Return the content of a section."""
     found = re.search(rb"\$%b[ \r]*\n(.*?)\s?\$End%b" % (name.encode(), name.encode()), data, re.DOTALL)
     if not found:
         raise ValueError(f"no ${name}, must have it")
@@ -92,7 +92,7 @@ def _section(data: bytes, name: str) -> bytes:
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return numbers and dimensions (k, 2) of physical groups by name."""
+    """Return the numbers and dimensions (k, 2) of physical groups by name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -102,7 +102,7 @@ def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
 
 
 def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
-    """Yield the dimension and number of entities with the numbers of their physical groups."""
+    """Yield (dimension, number) of each entity with the numbers of its physical groups."""
     for dim, count in enumerate(numbers.take(4, "u")):
         for _ in range(count):
             (tag,) = numbers.take(1)
@@ -127,7 +127,7 @@ def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int64]]]:
-    """Yield the dimension and number of entities with the kind and nodes (n, k) of their elements."""
+    """Yield dimension and number of each entity with the kind and nodes (n, k) of its elements."""
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Kinds of cells of meshes: their facets, and how they are split into domains.
+"""Cell types of meshes: their facets, and their division into particle domains.
 
-A triangle is split into three quadrilaterals, a tetrahedron into four hexahedra with plane faces, one at each vertex v,
-with the means of v and of some of the others as corners.  A wedge is three such quadrilaterals, drawn along its third
-direction; a pyramid is two tetrahedra.  So a facet is split alike by the cells on both of its sides, whatever their
-kinds, but for quadrilaterals: hexahedra keep them whole.
+A triangle is divided into three quadrilaterals, a tetrahedron into four hexahedra with plane faces.  There is one
+domain for each vertex, with corners at the means of the vertex and some others.  A wedge is divided like its triangle;
+a pyramid is two tetrahedra.  Neighbouring cells of any types divide a common facet alike, except for a quadrilateral of
+a hexahedron, which stays whole.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.points.cutting import FACES, corner_bits
 
 KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
-"""Cells that become domains, and their numbers of vertices."""
+"""Cell types that become domains, and their numbers of vertices."""
 SIDES_OF = {2: {"line": 2}, 3: {"triangle": 3, "quad": 4}}
-"""Cells that are sides."""
+"""Cell types of sides."""
 AS_LATTICE = {"quad": [0, 1, 3, 2], "hexahedron": [0, 1, 3, 2, 4, 5, 7, 6]}
-"""Vertices of meshio's cells with the first axis fastest."""
+"""Order of meshio's vertices with the first axis fastest."""
 SECOND_ORDER = {
     **{"line3": "line", "triangle6": "triangle", "triangle7": "triangle", "quad8": "quad", "quad9": "quad"},
     **{"tetra10": "tetra", "hexahedron20": "hexahedron", "hexahedron24": "hexahedron", "hexahedron27": "hexahedron"},
     **{"wedge12": "wedge", "wedge15": "wedge", "wedge18": "wedge", "pyramid13": "pyramid", "pyramid14": "pyramid"},
 }
-"""Kinds of second order, whose vertices come first, and those that have these vertices alone."""
+"""Second-order cell types, which list vertices first, and the matching first-order types."""
 LOOPS = {
     "triangle": [(0, 1), (1, 2), (2, 0)],
     "quad": [(0, 1), (1, 3), (3, 2), (2, 0)],
@@ -38,26 +38,26 @@ LOOPS = {
     "wedge": [(0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)],
     "pyramid": [(0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)],
 }
-"""Vertices of the facets of each kind, around; quadrilaterals and hexahedra with the first axis fastest."""
+"""Vertices around each facet of a cell type; quadrilaterals and hexahedra with the first axis fastest."""
 
 
 class Block(NamedTuple):
-    """Cells of one kind: meshio's own blocks know not all kinds of second order."""
+    """Cells of one type; meshio's own blocks lack some second-order types."""
 
     type: str
     data: NDArray[np.int64]
 
 
 def edges(kind: str) -> list[tuple[int, int]]:
-    """Return the vertices of the edges of a kind, each once, numbered as those of `LOOPS`."""
+    """Return the vertices of the edges of a cell type, each once, in the numbering of `LOOPS`."""
     around = [pair for loop in LOOPS[kind] for pair in zip(loop, (*loop[1:], loop[0]), strict=True)]
     return sorted({tuple(sorted(pair)) for pair in around})
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return where each of the different rows (n, k) is first, the rows ascending, and which of them each row (n,) is.
+    """Return the first index of each distinct row (n, k), in sorted order, and the distinct row of each row (n,).
 
-    numpy's unique compares rows as one object each, five times slower.
+    This is five times faster than numpy's unique, which compares rows as objects.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
@@ -70,8 +70,8 @@ def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 class Part:
     """A domain that is a part of a cell.
 
-    corners : (2^d,) of the vertices whose mean each corner is; faces : (2d,) of the vertices of the facet that each
-    face lies on, none of a face in the cell.
+    corners (2^d,): the vertices whose mean is each corner; faces (2d,): the vertices of the facet that contains each
+    face, empty for a face inside the cell.
     """
 
     corners: tuple[tuple[int, ...], ...]
@@ -79,7 +79,7 @@ class Part:
 
 
 def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
-    """Return the parts of a cell that is made of simplices."""
+    """Return the parts of a cell that is a union of simplices."""
     d, out = len(simplices[0]) - 1, []
     bits = corner_bits(d)
     for simplex in simplices:
@@ -95,7 +95,7 @@ def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
 
 
 def _wedge() -> list[Part]:
-    """Return the parts of a wedge: those of its triangle, from its lower to its upper end."""
+    """Return the parts of a wedge: the parts of its triangle, extruded."""
     out, quads = [], LOOPS["wedge"][2:]
     for part in _of_simplices("triangle", (0, 1, 2)):
         corners = [tuple(v + end for v in of) for end in (0, 3) for of in part.corners]
@@ -121,10 +121,10 @@ PARTS = {
 
 @dataclass(frozen=True, eq=False)
 class Polytopes:
-    """Cells as convex polytopes, of all kinds; arrays over n cells.
+    """Cells of all types as convex polytopes; arrays over n cells.
 
-    x : (n, k, d), m, vertices, the last one as often as is needed; normals : (n, f, d) of facets, edges : (n, e, d), m,
-    zeros where there are fewer; warp : (n,), m, how far vertices of facets lie off planes.
+    x (n, k, d): vertices, m, padded by the last one; normals (n, f, d): of facets, padded by zeros; edges (n, e, d): m,
+    padded by zeros; warp (n,): distance of facet vertices from a plane, m.
     """
 
     x: NDArray[np.float64]
@@ -134,7 +134,7 @@ class Polytopes:
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return cells (n, k) by kind, of vertices x (nodes, d), m, one kind after the other."""
+        """Return cells (n, k) by type with vertices x (nodes, d), m, one type after the other."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
@@ -143,10 +143,10 @@ class Polytopes:
     def apart(
         self, i: NDArray[np.int64], j: NDArray[np.int64], slack: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return which pairs (m,) of cells i, j no plane parts, and how deep these lie in each other, m.
+        """Return which pairs (m,) of cells i, j overlap, and by how much, m.
 
-        Planes along a facet of one, or in 3D along an edge of each, are enough for convex cells.  Pairs that lie in
-        each other by less than `slack` (m,), m, are parted.
+        Convex cells overlap if no plane separates them.  Normals of their facets and, in 3D, cross products of their
+        edges are sufficient candidates.  Overlaps below `slack` (m,), m, are ignored.
         """
         left, depth = np.arange(len(i)), np.full(len(i), np.inf)
         for normals in self._planes():
@@ -163,7 +163,7 @@ class Polytopes:
         return left, depth[left]
 
     def _planes(self):
-        """Yield functions that give the normals (m, d) of a plane of each of some pairs of cells."""
+        """Yield functions that return normals (m, d) of candidate planes for pairs of cells."""
         for f in range(self.normals.shape[1]):
             yield lambda i, j, f=f: self.normals[i, f]
             yield lambda i, j, f=f: self.normals[j, f]
@@ -174,19 +174,19 @@ class Polytopes:
 
 
 def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products (n, 3) of edges, nothing of those that are parallel but for rounding."""
+    """Return the cross products (n, 3) of edges, zero for edges that are parallel within rounding."""
     out = np.cross(a, b)
     size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.where((np.linalg.norm(out, axis=1) > SAME * size)[:, None], out, 0.0)
 
 
 def _shape(kind: str) -> tuple[range, list, list]:
-    """Return the vertices, facets and edges of a kind."""
+    """Return the vertices, facets and edges of a cell type."""
     return range(1 + max(map(max, LOOPS[kind]))), LOOPS[kind], edges(kind)
 
 
 def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return what `Polytopes` have of cells of one kind with corners x (n, k, d), with room for so many."""
+    """Return the arrays of `Polytopes` for cells of one type with corners x (n, k, d), padded to these numbers."""
     _, loops, ends = _shape(kind)
     corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
     normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))

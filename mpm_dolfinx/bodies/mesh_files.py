@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Meshes of others as bodies: files and objects of meshio, meshes of dolfinx with their tags."""
+"""Bodies from meshes: files and objects of meshio, meshes of dolfinx with tags."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from mpm_dolfinx.points.cutting import FACES
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
 TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_markers", "CellEntityIds")
-"""Data of meshio's cells that number parts and sides."""
+"""Names of meshio's cell data that number parts and sides."""
 OF_DOLFINX = {2: {"triangle": 6, "quad": 9}, 3: {"tetra": 10, "hexahedron": 27}}
-"""Cells of dolfinx that become domains, and their numbers of nodes where they are of second order."""
+"""Cell types of dolfinx that become domains, and their numbers of nodes at second order."""
 
 
 def from_mesh(
@@ -46,40 +46,38 @@ def from_mesh(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a body from a mesh: its cells are the points' domains; return the body.
+    """Seed a body from a mesh, with its cells as particle domains; return the body.
 
-    Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D, of surfaces in 3D, surfaces of
-    Abaqus, or facet tags.
-    A body of each part of a mesh shares its inner faces with those of the others: no surface is between them while both
-    are there.  Reference positions are those of the mesh.  Its points lie on no lattice, along which waves that no node
-    sees would be filtered.
+    Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
+    surfaces, or facet tags.  Bodies from several parts of a mesh share their inner faces, which are no surface while
+    both are present.  The mesh has reference positions.  The points form no lattice, so the filter of short
+    waves does not act.
 
     Parameters
     ----------
     grid
         Background grid.
     mesh
-        A file that meshio reads, an input file of Abaqus, a meshio mesh, or a dolfinx mesh: of triangles and
-        quadrilaterals in 2D, of tetrahedra, hexahedra, wedges and pyramids in 3D.  Of cells of second order the corners
-        are taken (a warning says how far nodes lie off straight edges).  In 2D cells lie in a plane of equal z.
+        A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh: triangles and quadrilaterals in
+        2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
+        warning of the distance of nodes from straight edges.  2D cells lie in a plane of equal z.
     part
-        Name of a group of cells, such as a physical group, a part, instance or set of Abaqus, or a number in data such
-        as "MaterialIDs"; by default all cells.
+        Name of a group of cells, such as a physical group, an Abaqus part, instance or set, or a number in data such as
+        "MaterialIDs"; by default all cells.
     cell_tags, facet_tags
-        Of a dolfinx mesh; cell_tags also the name of a file's data of cells that number parts and sides.
+        Tags of a dolfinx mesh; cell_tags also the name of a file's cell data that number parts and sides.
     names
-        Numbers of tags by the names that they get; others without a name are called by their digits, such as "3".
+        Numbers of tags by name; other tags are named by their digits, such as "3".
     per_cell
-        Points per cell of the grid and direction that are wanted, >= 1: domains with an edge of more than 1.5 cells /
-        per_cell are split.
+        Desired points per grid cell and direction, >= 1; domains with an edge above 1.5 cells / per_cell are split.
     material
         Index of the material in the scene's list, >= 0.
 
     Raises
     ------
     ValueError
-        A file that is not there or cannot be read, another kind of mesh, unknown parts, cells that are flat, inside out
-        or not convex, that are there twice or lie on one another, vertices outside the grid, hanging or doubled nodes.
+        A missing or unreadable file; another kind of mesh; an unknown part.  Cells that are flat, inverted, non-convex,
+        repeated or overlapping; vertices outside the grid; hanging or duplicate nodes.
     """
     instance("body: grid", grid, Grid)
     name, names = "mesh", _numbers(names)
@@ -89,7 +87,7 @@ def from_mesh(
     if isinstance(mesh, meshio.Mesh):
         if not (cell_tags is None or isinstance(cell_tags, str)) or facet_tags is not None:
             raise ValueError(
-                "mesh: cell_tags and facet_tags must be of a dolfinx mesh; or cell_tags a name of cells' data"
+                "mesh: cell_tags and facet_tags must be tags of a dolfinx mesh, or cell_tags the name of cell data"
             )
         found = _of_meshio(grid, mesh, names, cell_tags, name)
     else:
@@ -99,12 +97,12 @@ def from_mesh(
 
 
 def _file(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file; what meshio prints of it is kept for the message."""
+    """Return the mesh of a file; its error message contains meshio's output."""
     said = StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):
             return mesh_readers.read(file)
-    except (Exception, SystemExit) as error:  # meshio ends the program where it cannot read a file
+    except (Exception, SystemExit) as error:  # meshio exits for a file that it cannot read
         why = line_of(error) if isinstance(error, Exception) else " ".join(said.getvalue().split())
         why = why or type(error).__name__
         allowed = "" if " must " in why else "; must be a file that meshio reads"
@@ -112,7 +110,7 @@ def _file(file: Path) -> meshio.Mesh:
 
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Return a mesh of meshio's; tags: name of the cells' data that number parts and sides."""
+    """Return a meshio mesh; tags: name of the cell data that number parts and sides."""
     mesh_readers.check_systems(mesh)
     dim = grid.dim
     x = _positions(grid.dim, mesh.points)
@@ -163,7 +161,7 @@ def _positions(dim: int, points: Any) -> NDArray[np.float64]:
 
 
 def _first_order(dim: int, block: Any) -> tuple[str, NDArray[np.int64]]:
-    """Return the kind of a block of meshio's cells, of second order that of their corners, and their nodes."""
+    """Return the first-order type of a block of meshio's cells, and their nodes."""
     kind = SECOND_ORDER.get(block.type, block.type)
     if kind not in [*KINDS[dim], *SIDES_OF[dim], "vertex", "line"]:
         raise ValueError(f"mesh: has cells {block.type!r}, must be of {' and '.join(KINDS[dim])} for a grid in {dim}D")
@@ -172,21 +170,21 @@ def _first_order(dim: int, block: Any) -> tuple[str, NDArray[np.int64]]:
 
 
 def _vertices(dim: int, kind: str) -> int:
-    """Return how many vertices a cell of a kind has."""
+    """Return the number of vertices of a cell type."""
     return {"vertex": 1, "line": 2, **SIDES_OF[dim], **KINDS[dim]}[kind]
 
 
 def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
-    """Refuse cells of nodes that are not there."""
+    """Raise an error for cells with unknown nodes."""
     if rows.size and not (rows.min() >= 0 and rows.max() < count):
         worst = rows.min() if rows.min() < 0 else rows.max()
         raise ValueError(f"mesh: a cell has the node {worst}, must be one of {count}, from 0 on")
 
 
 def _beside(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
-    """Return how far nodes on the edges of cells of second order lie, at most, from the middles of these, m.
+    """Return the largest distance, m, of edge nodes of second-order cells from the midpoints of the edges.
 
-    These nodes follow the vertices; their order is that of a format.
+    Edge nodes follow the vertices, in an order that depends on the format.
     """
     first, second = np.array(edges(kind)).T
     corners = x[rows[:, AS_LATTICE.get(kind, range(1 + second.max()))]]
@@ -197,19 +195,17 @@ def _beside(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float
 
 
 def _warn_curved(grid: Grid, name: str, count: int, off: float) -> None:
-    """Warn of cells of second order, whose corners alone are taken."""
-    what = (
-        "%s: %d cells are of second order: their corners are taken, and edges are straight; nodes between corners lie "
-    )
-    warn(grid.comm, ResolutionWarning, what + "up to %.2g m off the middles", name, count, off)
+    """Warn about second-order cells, which are reduced to their corners."""
+    what = "%s: %d cells are of second order: only their corners are used, with straight edges; edge nodes lie "
+    warn(grid.comm, ResolutionWarning, what + "up to %.2g m off the midpoints", name, count, off)
 
 
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Return cells, and their indices by parts, in which those of several parts are there once.
+    """Return cells and their indices by part, where a cell of several parts occurs only once.
 
-    gmsh's format 2.2 has a cell once for each of its physical groups.
+    gmsh's format 2.2 repeats a cell for each of its physical groups.
     """
     cells = dict(cells)
     for kind, rows in cells.items():
@@ -219,8 +215,8 @@ def _merged(
         several = np.flatnonzero(np.bincount(same)[same] > 1)
         member = np.stack([np.isin(several, found[kind]) for found in parts.values()] or [np.zeros(len(several), bool)])
         if len(np.unique(np.stack([same[several], *member]), axis=1).T) < len(several):
-            continue  # twice in the same parts: refused, if it is to be filled
-        order = np.argsort(first)  # as they come
+            continue  # repeated in the same parts: an error if it is seeded
+        order = np.argsort(first)  # in the order of the file
         number = np.empty_like(order)
         number[order] = np.arange(len(order))
         cells[kind] = rows[np.sort(first)]
@@ -237,9 +233,9 @@ def _groups(
     names: Mapping[str, int],
     tags: str | None,
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield names of groups, and which cells (count,) of a block of meshio's belong to them."""
+    """Yield names of groups, and which cells (count,) of a meshio block belong to them."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
-    families = getattr(mesh, "cell_tags", None) or {}  # of MED: names of the groups of each number
+    families = getattr(mesh, "cell_tags", None) or {}  # MED: names of groups by number
     for key in (tags,) if tags is not None else TAGS:
         if key not in mesh.cell_data:
             continue
@@ -260,7 +256,7 @@ def _groups(
 
 
 def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
-    """Yield the names of gmsh's physical groups with their numbers and dimensions; a name may be that of several."""
+    """Yield gmsh's physical groups as (name, (number, dimension)); several groups may have the same name."""
     for name, value in field_data.items():
         if np.shape(value)[-1:] == (2,):
             for pair in np.reshape(value, (-1, 2)):
@@ -268,7 +264,7 @@ def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
 
 
 def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
-    """Return the numbers of tags by names that a user gives, if any."""
+    """Return the user's numbers of tags by name, if any."""
     whole = (int, np.integer)
     if names is not None and not (
         isinstance(names, Mapping) and all(isinstance(k, str) and isinstance(v, whole) for k, v in names.items())
@@ -278,17 +274,17 @@ def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
 
 
 def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield names, and which of some tags (n,) they stand for; tags without a name are called by their digits."""
+    """Yield names, and which tags (n,) have them; other tags are named by their digits."""
     for name, number in names.items():
         if (tags == number).any():
             yield name, tags == number
     for number in np.setdiff1d(tags, list(names.values())).tolist():
-        if number:  # 0 is no group
+        if number:  # 0 means no group
             yield str(number), tags == number
 
 
 def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int64]]) -> NDArray[np.float64]:
-    """Return the first coordinates (nodes, dim) of vertices (nodes, 2 or 3); refuse cells that leave the plane."""
+    """Return the first coordinates (nodes, dim) of vertices (nodes, 2 or 3); ValueError for cells outside one plane."""
     used = np.unique(np.concatenate([np.empty(0, np.int64), *(rows.ravel() for rows in cells.values())]))
     if not np.isfinite(x[used]).all():
         bad = used[~np.isfinite(x[used]).all(axis=1)][0]
@@ -300,7 +296,7 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
 
 
 def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Mesh:
-    """Return a dolfinx mesh, whole on every process; cells are ordered by their places, however they are shared out."""
+    """Return a dolfinx mesh, gathered on every process, with cells sorted by position for any partition."""
     dim = grid.dim
     topology = mesh.topology
     kind = _compat.cell_kind(mesh)
@@ -344,13 +340,13 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
 
 
 def _as_meshio(nodes: NDArray[np.int32], kind: str) -> NDArray[np.int32]:
-    """Return nodes (n, k) of dolfinx's cells with the vertices as meshio orders them."""
+    """Return nodes (n, k) of dolfinx's cells with the vertices in meshio's order."""
     order = AS_LATTICE.get(kind, [])
     return np.concatenate([nodes[:, order], nodes[:, len(order) :]], axis=1)
 
 
 def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the tags of entities of this process, 0 of those without one."""
+    """Return the tags of entities on this process, 0 without a tag."""
     found = np.zeros(entities.shape, dtype=np.int64)
     if tags is not None and len(tags.indices):
         at = np.minimum(np.searchsorted(tags.indices, entities), len(tags.indices) - 1)
@@ -359,7 +355,7 @@ def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def _facets(dim: int, kind: str) -> list[NDArray[np.int64]]:
-    """Return the vertices of each facet of a cell, as dolfinx orders them."""
+    """Return the vertices of each facet of a cell in dolfinx's order."""
     if KINDS[dim][kind] == dim + 1:
         return [np.delete(np.arange(dim + 1), k) for k in range(dim + 1)]
     return sorted(FACES[dim].tolist())

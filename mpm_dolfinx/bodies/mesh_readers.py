@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What meshio's readers lose or misplace in a file without a word: put right, or refused."""
+"""Mesh files through meshio, with corrections or errors for data that its readers silently lose or misplace."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpm_dolfinx.bodies import abaqus_files, gmsh_files
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file, put right where meshio would misread it; refuse what cannot be."""
+    """Return the mesh of a file, corrected for known errors of meshio; ValueError if that is impossible."""
     if abaqus_files.is_abaqus(file):
         return abaqus_files.read(file)
     version = gmsh_files.version(file) if file.suffix.lower() == ".msh" else ""
@@ -28,7 +28,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of Nastran, also of one with bulk data alone, as gmsh writes it."""
+    """Return the mesh of a Nastran file, also without the header that meshio needs, as gmsh writes it."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")
@@ -39,24 +39,24 @@ def _bulk(file: Path) -> meshio.Mesh:
 
 
 def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
-    """Refuse a file of VTK's in pieces, all but the last of which meshio drops."""
+    """Raise an error for a VTK file of several pieces, because meshio reads only the last one."""
     if file.suffix.lower() != ".vtu":
         return
     counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
     there, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
     if len(counts) > 1 and there != whole:
-        raise ValueError(f"{len(counts)} pieces of {whole} cells, of which {there} are read; must be one piece")
+        raise ValueError(f"{len(counts)} pieces of {whole} cells, but meshio reads {there}; must be one piece")
 
 
 def check_systems(mesh: meshio.Mesh) -> None:
-    """Refuse nodes of Nastran in coordinates of their own, which meshio takes for those of the basic system."""
+    """Raise an error for Nastran nodes in local coordinate systems, which meshio ignores."""
     systems = np.asarray(mesh.point_data.get("nastran:ref", 0))
     if systems.any():
         raise ValueError(f"mesh: GRID in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return the sets of cells, by name, numbered within their blocks: meshio numbers FLAC3D's through all of them."""
+    """Return cell sets by name, numbered within blocks; meshio numbers FLAC3D sets across all blocks."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

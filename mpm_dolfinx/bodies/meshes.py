@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Bodies from meshes: each cell is the domain of a material point, or is split into several.
+"""Bodies from meshes: each cell becomes one or more particle domains.
 
-How cells are split is said in `mesh_cells`.  Domains that are too large for the grid are halved by their own
-(tri)linear map until they are not.
+`mesh_cells` divides cells into domains.  Domains that are large for the grid are split further by their own
+(tri)linear map.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
 
-LONG = 1.5  # cells over points a cell and direction: domains with longer edges are split
-SMALL = 0.2  # of the cells that domains are wanted in: a warning names smaller ones
+LONG = 1.5  # times cells over per_cell: domains with longer edges are split
+SMALL = 0.2  # of the desired size of a domain: a warning reports smaller ones
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh as it was read, the same on every process.
+    """A mesh, equal on every process.
 
-    x : (nodes, d), m; cells : kind -> (n, k) nodes, quadrilaterals and hexahedra with the first axis fastest;
-    parts : name -> kind -> indices of its cells; sides : name -> facets as arrays (m, k) of nodes.
+    x (nodes, d): m; cells: kind -> nodes (n, k), quadrilaterals and hexahedra with the first axis fastest; parts: name
+    -> kind -> indices of its cells; sides: name -> facets as arrays (m, k) of nodes.
     """
 
     x: NDArray[np.float64]
@@ -44,7 +44,7 @@ class Mesh:
     sides: Mapping[str, Sequence[NDArray[np.int64]]]
 
     def part(self, name: str | None) -> dict[str, NDArray[np.int64]]:
-        """Return the cells of a part, or all of them, by kind."""
+        """Return the cells of a part, or all cells, by kind."""
         if name is not None and (not isinstance(name, str) or name not in self.parts):
             known = ", ".join(map(repr, self.parts)) or "none, for the mesh has no parts with a name"
             raise ValueError(f"mesh: part {name!r}, must be one of its parts: {known}")
@@ -59,10 +59,10 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshBody(Body):
-    """A body seeded from a mesh; the boxes of its domains are those around them.
+    """A body seeded from a mesh; the boxes of its domains are bounding boxes.
 
-    vertices : (n, 2^d, d), m — corners of the domains before all maps; surface : (n, d, 2), whether a face of a domain
-    lies on the surface; tagged : name -> (n, d, 2), whether it belongs to a side.
+    vertices (n, 2^d, d): corners of the domains before all maps, m; surface (n, d, 2): whether a face lies on the
+    surface; tagged: name -> (n, d, 2), whether a face belongs to a side.
     """
 
     vertices: NDArray[np.float64]
@@ -107,13 +107,13 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) that have a face on a side, ascending, and the numbers (m,) of these faces."""
+        """Return the domains (m,) with a face on a side, ascending, and the numbers (m,) of these faces."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on the surface whose normal is nearest to an end of an axis."""
+        """Return the domains (m,) with a surface face of this direction, and the numbers of these faces; see `Body`."""
         row, face = self.outer()
         outward = face_vectors(self.corners(row), face)
         along = np.abs(outward).argmax(axis=1) == axis
@@ -121,16 +121,16 @@ class MeshBody(Body):
         return row[along], face[along]
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return how many domains the body has across an axis, and their edge, m; means."""
+        """Return the mean number of domains across an axis, and their mean edge, m."""
         edge = float(self.spacing[:, axis].mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains, before the map."""
         return self.vertices[chosen]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several."""
+        """Return numbers (m, 2^d) of the corners of domains; shared corners have one number."""
         return self._nodes[rows]
 
     @cached_property
@@ -142,7 +142,7 @@ class MeshBody(Body):
 
 
 def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: int, name: str) -> MeshBody:
-    """Return the body of a part of a mesh, or of all of it; see `from_mesh`."""
+    """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`."""
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
     cells = mesh.part(part)
     _check_once(mesh, cells, name)
@@ -161,7 +161,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
         nodes = facets[1 + count[1:].argmax()]
         x = mesh.x[nodes[nodes >= 0]].mean(axis=0)
         raise ValueError(f"{name}: three cells share the facet at {x}, must be two at most")
-    outer = (facet > 0) & (count[facet] == 1)  # 0 is no facet of a cell
+    outer = (facet > 0) & (count[facet] == 1)  # facet 0: face inside a cell
     twice = (of > 0) & (count[of] == 2)
     _check_sides(mesh, domains, facets, facet, count == 2, name)
     _check_apart(mesh.x, cells, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
@@ -176,9 +176,9 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facets that their faces lie on, and their cells.
+    """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facets of their faces, and their cells.
 
-    Nodes ascend; those of triangles begin with -1, and those of faces within a cell are all -1.
+    Nodes ascend, after -1 for triangles; faces inside a cell have only -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -197,14 +197,14 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_once(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Refuse a mesh that has a cell twice: it would weigh, and resist, as two."""
+    """Raise an error for repeated cells, which would count twice in weight and stiffness."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
         if (count > 1).any():
             x = mesh.x[nodes[first[count > 1][0]]].mean(axis=0)
-            what = f"{np.count_nonzero(count > 1)} cells ({kind}) are there more than once, the first at {x}"
-            raise ValueError(f"{name}: {what}, must be there once")
+            what = f"{np.count_nonzero(count > 1)} cells ({kind}) occur more than once, the first at {x}"
+            raise ValueError(f"{name}: {what}, must occur once")
 
 
 def _check_sides(
@@ -215,17 +215,17 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Refuse cells that lie on the same side of a facet (m,) that they share: their outward vectors add up there."""
+    """Raise an error for two cells on the same side of a common facet (m,), by the sum of their outward vectors."""
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
     of = facet.ravel()
     total = np.linalg.norm([sum_by(of, outward[:, a], size) for a in range(d)], axis=0)
     same = shared & (total > sum_by(of, np.linalg.norm(outward, axis=1), size) / 2)
-    same[0] = False  # no facet of a cell
+    same[0] = False  # faces inside cells
     if same.any():
         nodes = facets[same.argmax()]
         x, what = mesh.x[nodes[nodes >= 0]].mean(axis=0), "have both of their cells on one side, the first at"
-        raise ValueError(f"{name}: {same.sum()} facets {what} {x}: cells must not lie on one another")
+        raise ValueError(f"{name}: {same.sum()} facets {what} {x}: cells must not overlap")
 
 
 def _check_apart(
@@ -235,17 +235,17 @@ def _check_apart(
     neighbours: NDArray[np.int64],
     name: str,
 ) -> None:
-    """Refuse cells that lie in one another.
+    """Raise an error for overlapping cells.
 
-    Where all cells lie on the two sides of the facets that they share, how many cells lie at a place changes only at
-    the surface.  So if two lie at a place, there is one with a facet on the surface that lies in another.
+    Cells lie on both sides of each shared facet, so the number of cells at a place changes only across the surface.  An
+    overlap therefore involves a cell with a facet on the surface.
 
     Parameters
     ----------
     x : (nodes, d), m
         Positions of nodes.
     cells
-        By kind.
+        Cells by kind.
     outer : (m,)
         Cells with a facet on the surface.
     neighbours : (n, 2)
@@ -269,16 +269,16 @@ def _check_apart(
     if len(deep):
         one, other = boxes[pairs[deep[depth.argmax()]]]
         meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
-        what = f"{len(np.unique(pairs[deep]))} cells lie on one another, the first at {meet}"
-        raise ValueError(f"{name}: {what}, {depth.max():.3g} m deep; must not lie in each other")
+        what = f"{len(np.unique(pairs[deep]))} cells overlap, the first at {meet}"
+        raise ValueError(f"{name}: {what}, by {depth.max():.3g} m; must not")
 
 
 def _boxes_that_meet(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pairs (n,), (n,) of an outer cell and another whose boxes (m, 2, d) lie in each other.
+    """Return the pairs (n,), (n,) of an outer cell and another cell with overlapping boxes (m, 2, d).
 
-    Boxes are looked for by octaves of their size, so that few large ones do not make many of the small ones near.
+    The search runs by octaves of box size, so that a few large boxes do not find all small ones.
     """
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
@@ -298,7 +298,7 @@ def _boxes_that_meet(
 
 
 def _turned(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return domains, and the keys of their faces, with the first two axes changed of those that are left-handed."""
+    """Return domains and keys of their faces, with the first two axes of left-handed domains swapped."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
     swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
@@ -309,7 +309,7 @@ def _turned(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDAr
 
 
 def _check_convex(domains: NDArray[np.float64], name: str) -> None:
-    """Refuse cells that are flat, inside out or not convex: a corner, or a simplex that is cut, has no volume."""
+    """Raise an error for flat, inverted or non-convex cells: a corner, or a simplex of the cutting, has no volume."""
     d, bits = domains.shape[2], corner_bits(domains.shape[2])
     size = np.ptp(domains, axis=1).prod(axis=1)
     ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
@@ -325,14 +325,14 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the different facets (m, k), the first one no facet at all, and which one each face (n, 2d) lies on."""
+    """Return the distinct facets (m, k), the first for faces inside cells, and the facet of each face (n, 2d)."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
 
 
 def _among(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> NDArray[np.bool_]:
-    """Return which facets (m,) of a mesh are among those of a side."""
+    """Return which facets (m,) of a mesh belong to a side."""
     width = facets.shape[1]
     rows = [np.pad(np.sort(n, axis=1), ((0, 0), (width - n.shape[1], 0)), constant_values=-1) for n in named]
     first, at = distinct(np.concatenate([facets, *rows]))
@@ -344,14 +344,14 @@ def _among(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> NDA
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return domains (m, 2^d, d) small enough for the grid, of which each is a part, and its faces (m, d, 2)."""
+    """Return domains (m, 2^d, d) that are small enough for the grid, their original domains, and faces (m, d, 2)."""
     d = grid.dim
     bits = corner_bits(grid.dim)
     out = []
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
     if grid.even:
         longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
-    else:  # as many cells as they reach over
+    else:  # lengths in cells
         y = grid.in_cells(domains - grid.base)
         edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
         longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)
@@ -368,21 +368,21 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Refuse a mesh with faces on its surface that lie on one another: they would be loaded, and drain, in the body."""
+    """Raise an error for surface faces in contact within one mesh, which would be loaded and drained."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
-        what = f"{len(np.unique(cover.face))} faces lie on others without sharing their nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged, or be of two parts")
+        what = f"{len(np.unique(cover.face))} faces touch others without common nodes, the first at {x}"
+        raise ValueError(f"{name}: {what}: hanging or duplicate nodes, must be merged, or belong to two parts")
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
-    """Warn of domains that are far smaller than the grid asks for."""
+    """Warn about domains that are much smaller than the grid needs."""
     cell = grid.sizes_at(body.centre - grid.base).prod(axis=-1)
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
     if len(small):
-        what = "%s: %d of %d domains are smaller than %.3g of what the grid can tell apart, the first at %s: "
-        what += "they cost as much as large ones; a coarser mesh would do"
+        what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s: "
+        what += "they cost as much as large ones; a coarser mesh is sufficient"
         warn(grid.comm, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])

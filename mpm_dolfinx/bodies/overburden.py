@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The weight that lies above places in bodies, straight up through their domains."""
+"""Overburden: weight of the domains vertically above positions in the bodies."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from mpm_dolfinx.points.cutting import FACES
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the vertical stress (m,), Pa, by the weight above places, and the height (m,), m, of the surface there.
+    """Return the overburden stress (m,), Pa, at positions, and the surface level (m,), m, above them.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
-        All domains of the bodies, convex; the last axis is the vertical one.
+        Convex domains of all bodies; the last axis is vertical.
     unit_weight : (n,), N/m^3
-        Of the domains.
+        Unit weights of the domains.
     x : (m, d), m
-        Places in the domains.
+        Positions in the domains.
     """
     low, high = corners.min(axis=1), corners.max(axis=1)
     half = (high - low)[:, :-1].max(initial=0.0) / 2
@@ -43,7 +43,7 @@ def overburden(
     top = top[met]
     surface = np.full(len(across), -np.inf)
     np.maximum.at(surface, ray, top)
-    # places above one another share what their line crosses: sums of it, sorted by line and height
+    # positions on one vertical line share cumulative sums, sorted by line and height
     order = np.lexsort((bottom, ray))
     ray = ray[order]
     weight = weight[order]
@@ -59,7 +59,7 @@ def overburden(
 
 
 def _chord(corners: NDArray, across: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
-    """Return between which heights (m,), m, vertical lines through (m, d-1) are in domains (m, 2^d, d)."""
+    """Return the heights (m,), (m,), m, at which vertical lines at (m, d-1) enter and leave domains (m, 2^d, d)."""
     d = corners.shape[2]
     for face in range(2 * d):
         n, on = face_vectors(corners, face), corners[:, FACES[d][face]].mean(axis=1)

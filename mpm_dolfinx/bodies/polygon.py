@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body from a polygon whose edges have names: gmsh fills it with quadrilaterals."""
+"""A body from a polygon with named edges, meshed with quadrilaterals by gmsh."""
 
 from __future__ import annotations
 
@@ -30,30 +30,30 @@ def polygon(
 ) -> MeshBody:
     """Seed a polygon, such as a slope or a layer, with points; return the body.
 
-    Layers and parts are a polygon each: bodies that touch stick, and no surface is between them, whatever the sizes.
-    Needs gmsh.
+    Layers and parts are separate polygons.  Polygons in contact stick without a surface between them, for any sizes of
+    their quadrilaterals.  Needs gmsh.
 
     Parameters
     ----------
     grid
         Background grid, in 2D.
     corners : (m, 2), m
-        Corners one after the other, either way around.
+        Consecutive corners, in either direction.
     sides
         Name of the edge from each corner to the next, "" for none, or one name for all; edges may share a name.
     holes : name -> (k, 2), m
         Corners of holes, such as a tunnel, by the names of their sides.
     size
-        Edge of the quadrilaterals, m; by default there are per_cell points per cell and direction.
+        Edge of the quadrilaterals, m; by default for per_cell points per cell and direction.
     per_cell, material
         As for `from_mesh`.
 
     Raises
     ------
     ImportError
-        There is no gmsh.
+        gmsh is missing.
     ValueError
-        A polygon or hole that crosses itself or others, or lies outside of the grid; names that do not fit.
+        A polygon or hole that crosses itself or another, or lies outside the grid; names that do not match.
     """
     instance("body: grid", grid, Grid)
     if grid.dim != 2:
@@ -71,7 +71,7 @@ def polygon(
         inner = _outline(f"hole {name!r}", inner)
         loops.append((inner, [name] * len(inner)))
     if size is None and not grid.even:
-        raise ValueError("polygon: size = None, must be given on a grid of cells of many sizes, m")
+        raise ValueError("polygon: size = None, must be given on a grid of unequal cells, m")
     default = grid.least / whole("body: per_cell", per_cell)
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])
@@ -80,7 +80,7 @@ def polygon(
 
 
 def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
-    """Return corners (m, 2), m, of which no two neighbours are one."""
+    """Return corners (m, 2), m; ValueError for coincident neighbours."""
     allowed = "at least 3 corners of 2 finite coordinates each, no two neighbours the same"
     x = numbers(f"polygon: {name}", corners, None, allowed=allowed)
     if x.ndim != 2 or x.shape[1] != 2 or len(x) < 3 or not np.any(np.roll(x, -1, axis=0) != x, axis=1).all():
@@ -89,18 +89,18 @@ def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
 
 
 def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
-    """Refuse outlines that touch or cross themselves or others, and holes that are not in the first one's inside."""
+    """Raise an error for outlines that touch or cross themselves or others, and for holes outside the polygon."""
     a, stop = np.concatenate(outlines), np.cumsum([len(x) for x in outlines])
     after = np.concatenate([np.roll(rows, -1) for rows in np.split(np.arange(len(a)), stop[:-1])])
     b = a[after]
     i, j = np.triu_indices(len(a), 1)
     beside = (after[i] == j) | (after[j] == i)
-    # two edges have a place in common if the ends of neither lie on one side of the other
+    # two edges intersect if the ends of each are not on one side of the other
     slack = ROUND_OFF * np.ptp(outlines[0], axis=0).max() ** 2
     sides = [_turn(a[i], b[i], a[j]), _turn(a[i], b[i], b[j]), _turn(a[j], b[j], a[i]), _turn(a[j], b[j], b[i])]
     apart = np.any([(np.minimum(*two) > slack) | (np.maximum(*two) < -slack) for two in (sides[:2], sides[2:])], axis=0)
     low, high = np.minimum(a, b), np.maximum(a, b)
-    apart |= ((low[i] > high[j]) | (low[j] > high[i])).any(axis=1)  # on one line
+    apart |= ((low[i] > high[j]) | (low[j] > high[i])).any(axis=1)  # collinear edges
     back = beside & (np.abs(np.where(after[i] == j, sides[1], sides[0])) <= slack)
     back &= np.einsum("nd,nd->n", b[i] - a[i], b[j] - a[j]) < 0
     wrong = np.flatnonzero((~apart & ~beside) | back)
@@ -110,21 +110,21 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
     for k, hole in enumerate(outlines[1:], start=1):
         within = [_inside(hole[0], outline) for m, outline in enumerate(outlines) if m != k]
         if not within[0] or any(within[1:]):
-            raise ValueError(f"polygon: the hole at {hole[0]} must be inside of the polygon, and of no other hole")
+            raise ValueError(f"polygon: the hole at {hole[0]} must be inside the polygon, and outside other holes")
 
 
 def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return on which side of the lines from a to b places c (n, 2) lie, and how far, times the way."""
+    """Return the signed areas (n,) of the parallelograms from a to b and to c (n, 2): > 0 on the left of a to b."""
     return _cross(b - a, c - a)
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the products (n,), across the plane, of vectors (n, 2)."""
+    """Return the scalar cross products (n,) of vectors (n, 2)."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
-    """Return whether a place (2,) is inside of a polygon: a ray from it crosses an odd number of edges."""
+    """Return whether a position (2,) is inside a polygon: a ray from it crosses an odd number of edges."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
     return bool((crosses & ((_cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
@@ -132,19 +132,19 @@ def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
 
 @contextmanager
 def _gmsh() -> Iterator:
-    """Give gmsh with a model of its own; what the user has in gmsh, and who hears Ctrl-C, stay what they are."""
+    """Provide gmsh with a separate model, and restore the user's gmsh state and handler of Ctrl-C."""
     hears = signal.getsignal(signal.SIGINT)
     try:
         import gmsh
     except ImportError as error:
         what = "polygon: needs gmsh: on Debian `apt install python3-gmsh`, elsewhere `conda install python-gmsh`"
         raise ImportError(what, name="gmsh") from error
-    tells = hasattr(gmsh, "isInitialized")  # before 4.9 it cannot be asked: it is begun again, and never ended
+    tells = hasattr(gmsh, "isInitialized")  # before 4.9 its state is unknown: initialised again, never finalised
     begun, talks = tells and gmsh.isInitialized(), 0.0
     if begun or not tells:
-        with suppress(Exception):  # before 4.9 it raises once somebody has ended it
+        with suppress(Exception):  # before 4.9 it raises after an earlier finalisation
             talks = gmsh.option.getNumber("General.Terminal")
-            gmsh.option.setNumber("General.Terminal", 0)  # of being begun again
+            gmsh.option.setNumber("General.Terminal", 0)  # hides the message about initialising again
     if not begun:
         gmsh.initialize()
     before = gmsh.model.getCurrent()
@@ -163,9 +163,9 @@ def _gmsh() -> Iterator:
 
 
 def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
-    """Return a polygon, and holes after it, filled with quadrilaterals of a size, m, and a triangle where none fits."""
+    """Return a polygon with holes, filled with quadrilaterals of a size, m, and single triangles where necessary."""
     extent = np.ptp(loops[0][0], axis=0).max()
-    origin = extent * np.round(loops[0][0][0] / extent, -2)  # where coordinates are large gmsh ends the process
+    origin = extent * np.round(loops[0][0][0] / extent, -2)  # gmsh aborts at large coordinates
     with _gmsh() as gmsh:
         geo = gmsh.model.geo
         named = {}
@@ -178,7 +178,7 @@ def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: fl
                 named.setdefault(name, []).append(tag)
         surface = geo.addPlaneSurface(curves)
         geo.synchronize()
-        gmsh.model.mesh.setRecombine(2, surface)  # of triangles a third is a kite, whose stress is less exact
+        gmsh.model.mesh.setRecombine(2, surface)  # thirds of triangles have less accurate stresses
         gmsh.model.mesh.generate(2)
         tags, x, _ = gmsh.model.mesh.getNodes()
         number = np.zeros(int(max(tags, default=0)) + 1, dtype=np.int64)

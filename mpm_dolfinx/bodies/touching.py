@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Where bodies touch: which parts of a face other faces cover, and how far domains are apart.
+"""Contact between bodies: covered parts of faces, and distances between domains.
 
-Faces are quadrilaterals in space; in plane strain they are a unit of length wide along a third axis.
+Faces are quadrilaterals in space.  In plane strain they have unit width along a third axis.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ BITS = corner_bits(2)  # Source: definition
 
 @dataclass
 class Faces:
-    """Faces of a body, after its map; arrays over m faces.
+    """Faces of a body after its map; arrays over m faces.
 
-    row : (m,) domain of each; index : (m, 4) corners of the domain; corners : (m, 4, 3), m; outward : (m, 3), m^2, area
-    vector; bend : (m,), m, see `Body.bend`.
+    row (m,): domain; index (m, 4): corners of the domain; corners (m, 4, 3): m; outward (m, 3): area vector, m^2; bend
+    (m,): m, see `Body.bend`.
     """
 
     row: NDArray[np.int64]
@@ -39,7 +39,7 @@ class Faces:
 
     @classmethod
     def of(cls, body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> Faces:
-        """Return faces of a body: those of some domains (m,), by their numbers (m,) in these."""
+        """Return faces of a body by domain (m,) and face number (m,)."""
         domains, dim = body.corners(row), body.dim
         outward = np.pad(face_vectors(domains, face), ((0, 0), (0, 3 - dim)))
         index = face_index(dim)[face]
@@ -50,11 +50,11 @@ class Faces:
 
     @classmethod
     def around(cls, body: Body) -> Faces:
-        """Return the faces on all sides of a body."""
+        """Return all surface faces of a body."""
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the shorter of the two edges (m, 2), m, along each of a face's axes."""
+        """Return the shorter of the two edges (m, 2), m, along each axis of a face."""
         c = self.corners
         along = [np.linalg.norm([c[:, 1] - c[:, 0], c[:, 3] - c[:, 2]], axis=2)]
         along += [np.linalg.norm([c[:, 2] - c[:, 0], c[:, 3] - c[:, 1]], axis=2)]
@@ -63,12 +63,12 @@ class Faces:
 
 @dataclass
 class Cover:
-    """Pairs of faces of which one lies on the other; arrays over n pairs.
+    """Pairs of faces in contact; arrays over n pairs.
 
-    face : (n,) the covered one; by : (n,) the covering one; low, high : (n, 2) its box in the coordinates of the
-    former, which go from 0 to 1; corner : (n, 4) corner of this box that each of its corners is, -1 where it is
-    turned against the box; t : (n, 4, 2) its corners; slack : (n,) error of the coordinates; plane : (n, 4, 2) its
-    corners in the coordinates of a parallelogram, along two edges of the former: in these what is straight is straight.
+    face (n,): the covered face; by (n,): the covering face; low, high (n, 2): bounding box of the covering face in the
+    coordinates of the covered one, from 0 to 1; corner (n, 4): corner of this box for each corner of the covering face,
+    -1 if it is rotated relative to the box; t (n, 4, 2): its corners; slack (n,): error of the coordinates; plane (n,
+    4, 2): its corners in affine coordinates along two edges of the covered face, in which straight lines stay straight.
     """
 
     face: NDArray[np.int64]
@@ -81,12 +81,12 @@ class Cover:
     plane: NDArray[np.float64]
 
     def at(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what each corner of the covering faces counts (n, 4) at coordinates t (n, 2) of the covered ones."""
+        """Return bilinear weights (n, 4) of the covering faces' corners at coordinates t (n, 2) of the covered ones."""
         return np.take_along_axis(weights((t - self.low) / (self.high - self.low)), self.corner, axis=1)
 
 
 def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
-    """Return the outward area vectors (m, d), m^(d-1), of the faces of domains (m, 2^d, d) with numbers (m,) or one."""
+    """Return the outward area vectors (m, d), m^(d-1), of faces of domains (m, 2^d, d), by face numbers (m,) or one."""
     dim = corners.shape[2]
     index = np.broadcast_to(FACES[dim][face], (len(corners), 2 ** (dim - 1)))
     x = np.take_along_axis(corners, index[:, :, None], axis=1)
@@ -103,17 +103,17 @@ _OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
 
 
 def face_index(dim: int) -> NDArray[np.int64]:
-    """Return which corners of a domain (2d, 4) its faces have; in plane strain each twice, at both ends of axis 3."""
+    """Return the corners (2d, 4) of the faces of a domain; in plane strain each twice, at both ends of a third axis."""
     return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
 
 
 def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what each corner of a face counts (n, 4) at its coordinates t (n, 2), from 0 to 1."""
+    """Return the bilinear weights (n, 4) of a face's corners at coordinates t (n, 2) in [0, 1]."""
     return np.where(BITS, t[:, None], 1 - t[:, None]).prod(axis=2)
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose boxes are within `reach`."""
+    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) with boxes within a distance `reach`."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -132,7 +132,7 @@ def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> 
 
 
 def covers(own: Faces, other: Faces) -> Cover:
-    """Return where faces of another body lie on faces of one, each seen from the other side."""
+    """Return the contacts between faces of a body and opposite faces of another."""
     i, j = near(own.corners, other.corners)
     n, m = (f.outward / np.maximum(np.linalg.norm(f.outward, axis=1, keepdims=True), TINY) for f in (own, other))
     back = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
@@ -154,12 +154,12 @@ def covers(own: Faces, other: Faces) -> Cover:
     ends = [np.clip(x, *within) for x in box]
     on = ((ends[1] - ends[0]) > slack[:, None]).all(axis=1)
     at = (ends[0] + ends[1]) / 2
-    off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # the same place but for faces that are no parallelograms
+    off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # differs only for faces that are not parallelograms
     at = np.where(straight[:, None], at, local(own.corners[i], off_edges[:, None], n[i])[0][:, 0])
     middle = np.einsum("nk,nkd->nd", weights(at), own.corners[i])
     _, beside = local(other.corners[j], middle[:, None], m[j])
-    gap = np.where(straight, 0.0, np.abs(beside[:, 0]))  # of those that are turned, between their middles
-    with np.errstate(divide="ignore", invalid="ignore"):  # of boxes without a width, which are not on
+    gap = np.where(straight, 0.0, np.abs(beside[:, 0]))  # rotated faces: at the middle of the overlap
+    with np.errstate(divide="ignore", invalid="ignore"):  # boxes of zero width, excluded by `on`
         for bits in BITS:
             at = out.at(np.where(bits, ends[1], ends[0]))
             gap = np.where(straight, np.maximum(gap, np.abs((at * off).sum(axis=1))), gap)
@@ -168,15 +168,15 @@ def covers(own: Faces, other: Faces) -> Cover:
 
 
 def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return faces (n, 4, 3) with their last corner put where two edges of the others tell."""
+    """Return faces (n, 4, 3) with the last corner moved, so that they are parallelograms."""
     return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
 def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the coordinates (n, c, 2) of places x (n, c, 3) in faces (n, 4, 3), and how far they are before them."""
+    """Return the coordinates (n, c, 2) of positions x (n, c, 3) in faces (n, 4, 3), and their normal distances."""
     t = np.full((*x.shape[:2], 2), 0.5)
     c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
-    for _ in range(8):  # Gauss and Newton's method; of parallelograms the first is exact
+    for _ in range(8):  # Gauss-Newton; the first step is exact for parallelograms
         a, b = t[..., :1], t[..., 1:]
         e = (c1 - c0) * (1 - b) + (c3 - c2) * b, (c2 - c0) * (1 - a) + (c3 - c1) * a
         r = x - (c0 * (1 - a) * (1 - b) + c1 * a * (1 - b) + c2 * (1 - a) * b + c3 * a * b)
@@ -190,7 +190,7 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
 
 
 def covered(count: int, cover: Cover) -> NDArray[np.float64]:
-    """Return the share of each of so many faces (m,), in its coordinates, that lies under others."""
+    """Return the covered fraction of each face (m,), in its coordinates."""
     s, owner = within(*_triangles(cover.t, cover.face), np.zeros(2), np.ones(2))
     return sum_by(owner, _areas(s), count)
 
@@ -198,7 +198,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return what is free of faces (m,) as triangles: the face (n,) of each, and its corners (n, 3, 2), from 0 to 1."""
+    """Return the free parts of faces (m,) as triangles: the face (n,), and corners (n, 3, 2) in [0, 1]."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -207,11 +207,11 @@ def uncovered_triangles(
     first = np.searchsorted(cover.face[of], faces)
     count = np.searchsorted(cover.face[of], faces, "right") - first
     s, owner = _triangles(whole, np.arange(len(faces)))
-    for k in range(count.max()):  # take the k-th of the faces that lie on each away
+    for k in range(count.max()):  # subtract the k-th covering face of each
         has = count[owner] > k
         free, whose = [s[:, :, ~has]], [owner[~has]]
         s, owner = s[:, :, has], owner[has]
-        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # around
+        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # in order around
         turn = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
         for a in range(4):
             p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
@@ -227,7 +227,7 @@ def uncovered_triangles(
     slack = np.zeros(len(faces))
     np.maximum.at(slack, np.searchsorted(faces, cover.face[of]), cover.slack[of])
     edge = np.linalg.norm(s - s[[1, 2, 0]], axis=1).max(axis=0)
-    some = 2 * _areas(s) > 2 * slack[owner] * edge  # chords of a curve that differ leave slivers, which would drain it
+    some = 2 * _areas(s) > 2 * slack[owner] * edge  # removes slivers between different chords of a curve
     s, owner = s[:, :, some].transpose(2, 0, 1), owner[some]
     kites = np.abs(whole[owner] - BITS).max(axis=(1, 2), initial=0.0) > SAME
     x = np.einsum(
@@ -238,7 +238,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return what of triangles (3, 2, n) lies in boxes (2,) or (n, 2), and their owners."""
+    """Return the parts of triangles (3, 2, n) in boxes (2,) or (n, 2), and their owners."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -248,7 +248,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return two triangles each (3, 2, 2n) of quadrilaterals (n, 4, 2), and their owners."""
+    """Return quadrilaterals (n, 4, 2) as two triangles each (3, 2, 2n), and their owners."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -264,12 +264,12 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return what of triangles (3, e, n) lies below a plane of an axis, and above it, each with its owners."""
+    """Return the parts of triangles (3, e, n) below a plane of an axis, and above it, each with owners."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
     below, below_owner, above, above_owner = cut_at(s[:, :, both], owner[both], axis, plane[both])
-    parts = (below, below_owner, low & ~high), (above, above_owner, high & ~low)  # what lies in the plane has no area
+    parts = (below, below_owner, low & ~high), (above, above_owner, high & ~low)  # triangles in the plane have no area
     out = [(np.concatenate([c, s[:, :, k]], axis=2), np.concatenate([o, owner[k]])) for c, o, k in parts]
     return *out[0], *out[1]
 
@@ -284,15 +284,15 @@ def uncovered(
     count
         Number of faces.
     face, low, high : (n,), (n, 2), (n, 2)
-        Boxes that cover faces, in coordinates that go from 0 to 1 over a face.
+        Boxes that cover faces, in coordinates from 0 to 1 over a face.
     slack : (n,)
-        By how much ends of boxes that are one may differ.
+        Largest difference between ends of boxes that coincide.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)
     k, most = len(touched), np.full(len(touched), SAME)
     np.maximum.at(most, row, slack)
-    # along both axes: planes through the ends of boxes, of all faces in turn
+    # along both axes: planes through the ends of boxes, for all faces in turn
     ends = []
     lines = []
     start = []
@@ -319,7 +319,7 @@ def uncovered(
             np.add.at(cover, offset[row] + ends[0][e0] * size[1][row] + ends[1][e1], 1 if e0 == e1 else -1)
     owner = np.repeat(np.arange(k), block)
     i, j = np.divmod(np.arange(len(cover)) - offset[owner], size[1][owner])
-    cover = np.cumsum(cover)  # along the second axis: a row of a face sums to nothing
+    cover = np.cumsum(cover)  # along the second axis; each row of a face has sum zero
     across = np.lexsort((i, j, owner))
     cover[across] = np.cumsum(cover[across])
     free = (cover == 0) & (i < size[0][owner] - 1) & (j < size[1][owner] - 1)
@@ -327,7 +327,7 @@ def uncovered(
     stop = np.flatnonzero(free & np.append(~free[1:], True)[: len(free)])
     order = np.lexsort((i[begin], j[stop], j[begin], owner[begin]))
     begin, stop = begin[order], stop[order]
-    same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # runs of runs along the first
+    same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # runs of runs along the first axis
     first = np.append(True, np.any([np.diff(s) != 0 for s in same], axis=0))[: len(begin)]
     last = np.append(first[1:], True)[: len(begin)]
     stop = stop[last]
@@ -344,9 +344,9 @@ def uncovered(
 
 
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far convex domains a, b (n, 2^d, d), m, are apart (n,), m; negative: how deep they lie in each other.
+    """Return the gaps (n,), m, between convex domains a, b (n, 2^d, d), m; a negative gap is the overlap.
 
-    Domains do not overlap if a plane lies between them: along a face of one, or in 3D along an edge of each.
+    Domains do not overlap if a plane separates them: parallel to a face or, in 3D, to an edge of each.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
@@ -360,7 +360,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return how far planes of these normals (n, d) can be apart between domains (n,), m."""
+    """Return the largest distances (n,), m, between two separating planes of these normals (n, d)."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -372,7 +372,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return convex domains (m, 2^d, d), m, that fill a body, a box as one, and their allowances (m,), m."""
+    """Return convex domains (m, 2^d, d), m, that fill a body, one for a box, and their tolerances (m,), m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
@@ -381,7 +381,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     warp = np.zeros(len(body))
     if len(size) == 3 and not body.aligned:
         for face, index in enumerate(FACES[3]):
-            f, n = corners[:, index], face_vectors(corners, face)  # what lies in the plane of a face is no warp
+            f, n = corners[:, index], face_vectors(corners, face)  # only the normal part is warp
             off = np.einsum("nd,nd->n", f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], n)
             warp = np.maximum(warp, np.abs(off) / np.maximum(np.linalg.norm(n, axis=1), TINY) / 4)
     edge = np.ptp(corners, axis=1).min(axis=1)
@@ -389,7 +389,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much domains that touch, with edges (m,), m, may seem to lie in or off each other."""
+    """Return the tolerance of gaps and overlaps, m, of touching domains with edges (m,), m."""
     return NEAR / 2 * edge
 
 
@@ -398,10 +398,10 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return how deep domains lie in others, m, how many cells they are apart, and where (d,).
+    """Return the largest overlap of domains, m, their smallest gap in cells, and its place (d,).
 
-    in_cells gives places in cells.  a, b: domains and their allowances, see `solids`.  Those that touch are 0 m deep,
-    0 cells apart; far ones inf cells.
+    in_cells: converts positions to cells; a, b: domains and tolerances, see `solids`.  Touching domains have overlap 0
+    and gap 0; distant ones a gap of inf.
     """
     i, j = near(a[0], b[0])
     apart, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
@@ -422,15 +422,15 @@ def meeting(
 
 
 def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-    """Refuse bodies that lie in each other as seeded; log a warning for those that do not touch and yet will stick."""
+    """Raise an error for seeded bodies that overlap; warn about separate bodies that will stick."""
     there = [i for i in range(len(bodies)) if present[i]]
     found = {i: solids(bodies[i]) for i in there} if len(there) > 1 else {}
     first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
     for i, j in combinations(there, 2):
         depth, gap, x = meeting(found[i], found[j], lambda x: grid.in_cells(x - grid.base))
         if depth:
-            raise ValueError(f"bodies {i} and {j}: both are at {x}, {depth:.3g} m deep, must not lie in each other")
-        together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # else they share no node
+            raise ValueError(f"bodies {i} and {j}: overlap at {x} by {depth:.3g} m, must not")
+        together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # contact groups share no node
         if together and 0 < gap < 1 and not any(_lies_in(x, found[k][0]) for k in there if k not in (i, j)):
             warn_near(grid, f"bodies {i} and {j}", gap, x)
 
@@ -443,9 +443,9 @@ def _lies_in(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
-    """Warn for bodies that do not touch but are less than a cell apart: they share nodes, and so stick."""
+    """Warn about bodies with a gap below one cell: they share nodes, and therefore stick."""
     if 0 < gap < 1:
-        where = "%s: %.2g cells apart at %s, and yet they stick, as they share nodes of the grid"
+        where = "%s: %.2g cells apart at %s, but they stick, because they share nodes of the grid"
         warn(
             grid.comm,
             ResolutionWarning,

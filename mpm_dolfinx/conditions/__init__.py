@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Conditions that users give, and the sides of bodies that they act on."""
+"""Conditions of a scene, and the sides of bodies to which they apply."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""What acts on the momentum: the one protocol of tractions, given displacements, tools, weight, conditions of users.
+"""Interface of all loads on the momentum: tractions, prescribed displacements, tools, weight, user conditions.
 
-To add a condition: give it a method `acting(setting)`, which returns an `Acting`.  For the fluid: `flow/feeding.py`.
+A condition has a method `acting(setting)` that returns an `Acting`.  Conditions on the fluid: `flow/feeding.py`.
 
-A condition is placed three times: `Acting` once a stage, where it finds its faces; `Acting.placed` once a substep, with
-the faces where they have moved to; and its `Loads` add to residual and tangent as often as these are assembled.  The
-step and the balance of momentum loop over them, and know none by name.
+Each condition has three levels.  `Acting` is made once a stage and finds the faces.  `Acting.placed` returns the
+`Loads` of a substep at the present position of the faces.  `Loads` add to residual and tangent at each assembly.  The
+step and the momentum balance loop over all of them, and know no condition by name.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from mpm_dolfinx.points.parts import Parts
 T = TypeVar("T")
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
-"""What conditions do to the bodies, by quantity, such as "reactions", and by name of the condition."""
+"""Effects of conditions on the bodies, by quantity, such as "reactions", and by name of the condition."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
-"""Those of the conditions of the package."""
+"""Quantities of the package's own conditions."""
 
 
 class FormsOf:
-    """The compiled forms of a scene's conditions: each kind of form is made once, when a condition first asks for it.
+    """Compiled forms of a scene's conditions; each kind of form is made at its first use.
 
     Parameters
     ----------
     grid
         Background grid.
     u
-        Increment of the displacement in the step, m.
+        Displacement increment of the step, m.
     velocity
-        Of the bodies in a substep.
+        Velocity of the bodies in a substep.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
@@ -57,23 +57,23 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return what `make` returns of the grid, u and more, a class of forms."""
+        """Return the forms that the class `make` returns for grid, u and further arguments; each class only once."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
 
     @property
     def made(self) -> set[str]:
-        """Names of the kinds that have been asked for."""
+        """Names of the form classes in use."""
         return {make.__name__ for make in self._made}
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Where a stage puts its conditions.
+    """Setting of the conditions in a stage.
 
-    sides: finds their faces; free (nodes, d): components that no wall holds; materials: those of the scene; forms: its
-    compiled forms; conditions: all of the stage, by name.
+    sides: finds the faces of conditions; free (nodes, d): components without a fixing wall; materials: the scene's;
+    forms: the scene's compiled forms; conditions: all conditions of the stage, by name.
     """
 
     sides: Sides
@@ -88,16 +88,16 @@ class Setting:
         return self.sides.grid
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of some classes by their names."""
+        """Return the conditions of some classes by name."""
         return {name: one for name, one in self.conditions.items() if isinstance(one, kinds)}
 
 
 class Place(NamedTuple):
-    """When and where a condition acts in a substep.
+    """Place and time of a condition in a substep.
 
-    cut, points: the domains as they are cut, and the points as they are now; pieces: their points of integration, see
-    `QuadratureData`; start, dt: of the step, s; t: end of the substep, s; before: outcome of the last step; inertia:
-    whether bodies have any.
+    cut, points: cut particle domains, and present points; pieces: their quadrature points, see `QuadratureData`; start,
+    dt: start and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether
+    the bodies have inertia.
     """
 
     cut: CutDomains
@@ -111,7 +111,7 @@ class Place(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """Shares own and before of a substep in its step, s, see `Substep`; gravity (d,) in it, m/s^2, if there is any."""
+    """Time weights own and before of a substep, s, see `Substep`; gravity (d,), m/s^2, in it, None without."""
 
     own: float
     before: float
@@ -119,146 +119,143 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Displacements u of the step, a local array, m, and which of them are unknowns."""
+    """Displacement increment u of the step, a local array, m, and the numbering of its unknowns."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
 
     @property
     def nodal(self) -> NDArray[np.float64]:
-        """u by nodes (nodes, d), m."""
+        """u as an array (nodes, d), m."""
         return self.u.reshape(-1, self.unknowns.dim)
 
 
 class Loads:
-    """What a condition does in a substep; of what a class does not define it does nothing.
+    """Effect of a condition in a substep.  Methods that a subclass does not define have no effect.
 
-    Arrays b are local ones of forces at the nodes, unrolled, N: what is added to ghosts is sent to their owners.
+    Arrays b are local nodal forces, unrolled, N; entries at ghosts are added at their owners.
     """
 
     linear: bool = True
-    """Whether its tangent is the same at all displacements."""
+    """Whether the tangent is independent of the displacement."""
     smooth: bool = True
-    """Whether the tangent of a substep may lead the next one."""
+    """Whether the tangent of a substep may serve in the next one."""
     varies: bool = False
-    """Whether `loads` and `resists` are to be asked for at each displacement."""
+    """Whether `loads` and `resists` depend on the displacement."""
     stiff: bool = False
-    """Whether it has a `penalty`."""
+    """Whether there is a `penalty`."""
     holding: bool = False
-    """Whether it may hold bodies in ways that `touching` does not tell."""
+    """Whether bodies may be constrained in ways that `touching` does not report."""
     couples: bool = False
-    """Whether its tangent joins nodes of different cells."""
+    """Whether the tangent couples nodes of different cells."""
     touches: bool = False
-    """Whether bodies may part from it."""
+    """Whether bodies may separate from the condition."""
     key: Any = None
-    """What the penalty depends on beside the places of faces."""
+    """Key of all dependences of the penalty except the positions of faces."""
 
     def begun(self, shares: Shares, gone: Any) -> Loads:
-        """Return the same in a substep of bodies with inertia; gone: what `flown` returned of the last one."""
+        """Return the loads for a substep with inertia; gone: result of `flown` in the previous substep."""
         return self
 
     def flown(self, at: At) -> Any:
-        """Return what the next substep of bodies with inertia needs of this one, which has been solved, at u."""
+        """Return data of this solved substep for the next one, with inertia."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return powers at u on this process, W: what slip on it takes, and what it brings beside `push`.
+        """Return powers at u on this process, W: dissipation by slip, and further power that `push` leaves out.
 
         v: velocities, a local array, m/s.
         """
         return 0.0, 0.0
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add the forces on the bodies that stay through the substep."""
+        """Add forces that are constant in the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the forces that stay and belong to the penalty: residuals are not measured by them."""
+        """Add the constant forces of the penalty, which do not enter the scale of residuals."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
-        """Add the forces on the bodies at u."""
+        """Add forces that depend on u."""
 
     def resists(self, b: NDArray[np.float64]) -> None:
-        """Add the forces at u that act as the bodies' own stresses do, against loads."""
+        """Add resisting forces at u, with the sign of internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add the forces at u that are counted with those of the stresses."""
+        """Add forces at u that enter the scale of residuals together with internal forces."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the matrix of forces that are linear in u; walls: to the rows of what walls hold."""
+        """Add the matrix of forces linear in u; walls: add the rows of components fixed by walls."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
         """Return the power, W, of `pulls` and `penalty` at u on this process; v: velocities, a local array, m/s."""
         return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add minus the derivative of `loads`, and the derivative of `resists`, at u; who calls finalises it."""
+        """Add the derivative at u of `resists`, less that of `loads`, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Take forces at u that residuals are not measured by off a residual, of the unknowns or what walls hold."""
+        """Subtract forces at u from a residual of the unknowns or of fixed components; they do not enter its scale."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return forces at u that add to the residual of the unknowns, and measure it, N; None without."""
+        """Return forces at u, N, that add to the residual of the unknowns and to its scale; None without."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return zeros wherever `coupling` may have entries that cells have not; None if nowhere."""
+        """Return a zero matrix with the pattern of `coupling` beyond that of the cells; None if there is none."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
-        """Return minus the derivative of what `push` takes off, as far as `tangent` has not added it."""
+        """Return minus the derivative of the forces in `push`, except for the part in `tangent`."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
+        """Update the slipping set at u and, if sticks, let points return to stick; return whether the set changed."""
         return False
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
-        """Go on with other forces where the balance is met; return whether they differ.
-
-        unknown (cells,): how well the balance tells forces in the local cells, N.
-        """
+    def augment(self, at: At) -> bool:
+        """Update the multipliers at equilibrium; return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:
-        """Find places anew at u; return whether the balance is another one since."""
+        """Update contact positions at u; return whether the equilibrium changed."""
         return False
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return displacements (nodes, d), m, near which the balance may be; None where nothing is known."""
+        """Return an initial guess of displacements (nodes, d), m; None if there is none."""
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the same with the forces of what is held after a displacement u, m, of the nodes, at rest."""
+        """Return the loads with the reactions of prescribed sides after a displacement u, m, of the nodes at rest."""
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled local degrees of freedom (n,) at walls, and forces (n,), N, there that walls do not bear."""
+        """Return unrolled local degrees of freedom (n,) on walls, and the forces (n,), N, on them not from the wall."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def touching(self) -> tuple | None:
-        """Return where it holds bodies at the start: cells (m,), cells of other sides that deform or None, places and
+        """Return the initial constraints: cells (m,), cells of the deformable other side or None, positions and
         directions (m, d).
         """
 
     @property
     def held_cells(self) -> NDArray[np.int32]:
-        """Local cells whose sides it holds."""
+        """Local cells with prescribed sides."""
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what rounding may leave of forces in the local cells (cells,), N, of what it leaves without."""
+        """Return rounding errors (cells,), N, of forces in the local cells, given the errors without it."""
         return of_cells
 
     @property
     def rounding_beside(self) -> float:
-        """What it may leave in cells of other sides, N."""
+        """Rounding error of forces in cells of other sides, N."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what it does to the bodies at u, by quantity and name of the condition."""
+        """Return the effects on the bodies at u, by quantity and name of the condition."""
         return {}
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with what they keep of it."""
+        """Return the points with the history of the condition."""
         return points
 
     def ended(self, at: At) -> Loads:
-        """Return the same at the end of the step."""
+        """Return the loads at the end of the step."""
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
@@ -268,20 +265,20 @@ class Loads:
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return corners (n, 2^d, d), m, put out of what they may not be in; all of them, or those a little inside.
+        """Return corners (n, 2^d, d), m, without penetration of forbidden regions; by default, small penetrations only.
 
-        free (n, 2^d, d): components that nothing else gives.
+        free (n, 2^d, d): components that no other condition prescribes; everywhere: correct penetrations of any depth.
         """
         return corners
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of domains with faces that it holds, where their tracked corners are."""
+        """Return new corners (m, 2^d, d), m, of domains whose prescribed faces keep their tracked corners."""
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse the points after a step, from those before it, where they are in what they may not be."""
+        """Raise an error if points lie in forbidden regions after a step; before: points at its start."""
 
 
 class Acting:
@@ -290,35 +287,35 @@ class Acting:
     Parameters
     ----------
     setting
-        Where they are put.
+        Setting of the stage.
     """
 
     conditions: ClassVar[tuple[type, ...]] = ()
-    """Classes of conditions of this kind."""
+    """Condition classes of this kind."""
     title: ClassVar[str] = "conditions of the user's own"
-    """What they are called where a scene lists what it has."""
+    """Name in the summary of a scene."""
     symmetric: bool = True
     """Whether the tangent is symmetric."""
     linear: bool = True
-    """Whether the tangent is the same at all displacements."""
+    """Whether the tangent is independent of the displacement."""
     surfaces: Sequence[Surface] = ()
-    """Faces on which they act; found together, these are cut once."""
+    """Loaded faces; all are cut together."""
     outside: Surface | None = None
-    """Faces that tools may meet."""
+    """Faces that tools may touch."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
-    """Conditions that hold faces, these faces, and the axes along which."""
+    """(condition, prescribed faces, prescribed axes)."""
 
     def placed(self, place: Place) -> Loads:
-        """Return what they do in a substep."""
+        """Return the loads of a substep."""
         raise NotImplementedError
 
     def check_start(self, place: Place) -> None:
-        """Refuse a stage that begins in a place where it cannot."""
+        """Raise an error if the stage cannot begin at this position."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what n points keep of each condition, by names of data, as it begins."""
+        """Return the initial history of n points for each condition, by name of the data."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return their outcome of this value before a first step."""
+        """Return the outcome before the first step, filled with this value."""
         return {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of conditions, by which their results are found."""
+"""Names of conditions, which identify their results."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ T = TypeVar("T")
 
 
 class ByName(dict[str, T]):
-    """What belongs to conditions by their names; in the order in which they were given."""
+    """Values of conditions by their names, in the order of the conditions."""
 
     @property
     def array(self) -> NDArray[np.float64]:
-        """All of it (conditions, ...), one above the other; what belongs to none is of shape (0,)."""
+        """All values (conditions, ...) as one array; shape (0,) without conditions."""
         return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:
-        """Refuse what is no name of them, such as a position."""
+        """Raise a KeyError for an unknown name, such as a position."""
         raise KeyError(f"{name!r}: must be the name of a condition: {', '.join(map(repr, self)) or 'there is none'}")
 
 
 def named(conditions: Sequence[Any]) -> dict[str, Any]:
-    """Return conditions by their names: those given, and of others the kind and side, made unique by a number.
+    """Return conditions by name: the given name, or kind and side, made unique by a number.
 
     Raises
     ------
     ValueError
-        A name that is none, or of two.
+        An invalid name, or a name used twice.
     """
     given = [getattr(one, "name", None) for one in conditions]
     for name, one in zip(given, conditions, strict=True):
         if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
             raise ValueError(f"{line(one)}: name = {line(name)}, must be of letters, digits, spaces, and any of _ . -")
         if name is not None and given.count(name) > 1:
-            raise ValueError(f"{line(one)}: name = {line(name)}: another condition has it, must be a name of its own")
+            raise ValueError(f"{line(one)}: name = {line(name)}: another condition has it, must be unique")
     out: dict[str, Any] = {}
     for name, one in zip(given, conditions, strict=True):
         base, count = name or _default(one), 1
@@ -54,7 +54,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
 
 
 def _default(condition: Any) -> str:
-    """Return the name of a condition that was given none: its kind, and the side on which it acts."""
+    """Return the default name of a condition: its kind, and its side."""
     kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(condition).__name__).lower()
     side = getattr(condition, "side", None)
     return kind if side is None else f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', str(side))}"

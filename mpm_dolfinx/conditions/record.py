@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Motions that were recorded: accelerograms, or velocities, as functions of time."""
+"""Recorded motions: accelerograms or velocities as functions of time."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from scipy.interpolate import PPoly
 from mpm_dolfinx.base.validation import flag, line, numbers, on_disk, path
 
 QUANTITIES = ("acceleration", "velocity")
-ALLOWED = "times that increase, s, and values, finite, in two columns of at least two rows"
+ALLOWED = "two columns of at least two rows: increasing times, s, and finite values"
 
 
 class Record:
-    """Motion that was recorded along a direction: a function of time (s) that gives its displacement (d,), m.
+    """Recorded motion along a direction: a function of time (s) that returns the displacement (d,), m.
 
-    Between its times the record is linear, and its integrals are exact.  Before the first one all is at rest; after the
-    last one nothing accelerates any more.
+    The record is linear between its times, with exact integrals.  Motion is zero before the first time, and has
+    constant velocity after the last one.
 
     Parameters
     ----------
     record : file, or (n, 2)
-        Times, s, and values at these, in two columns; in a file blanks or commas part them, and # begins comments.
+        Two columns, times, s, and values.  Files may use blanks or commas, and # for comments.
     direction : (d,)
-        Along which the values count; its length scales them: (9.81, 0) for a record in g.
+        Direction of the motion; its length scales the values: (9.81, 0) for a record in g.
     quantity
-        What was recorded: "acceleration", m/s^2, or "velocity", m/s.
+        Recorded quantity: "acceleration", m/s^2, or "velocity", m/s.
     at_rest
-        Whether the motion ends at rest where it began: accelerations are then less by a line in time.  Without it a
-        record whose integral is not zero goes on moving.
+        Correct the accelerations by a linear function of time, so that the motion ends at rest in its first position.
+        Without it, a record with a non-zero integral leaves a final velocity.
 
     Raises
     ------
     ValueError
-        The record is not finite, its times do not increase, or there are fewer than two.
+        Values that are not finite, times that do not increase, or fewer than two rows.
     OSError
         The file cannot be read.
     """
@@ -72,25 +72,25 @@ class Record:
         """Last time of the record, s."""
 
     def __call__(self, t: float) -> NDArray[np.float64]:
-        """Return the displacement (d,) at time t (s), m."""
+        """Return the displacement (d,), m, at time t (s)."""
         *_, u = self._of
         return self._within(u, t) + max(t - self.end, 0.0) * self.velocity(min(t, self.end))
 
     def velocity(self, t: float) -> NDArray[np.float64]:
-        """Return the velocity (d,) at time t (s), m/s."""
+        """Return the velocity (d,), m/s, at time t (s)."""
         return self._within(self._of[1], t)
 
     def acceleration(self, t: float) -> NDArray[np.float64]:
-        """Return the acceleration (d,) at time t (s), m/s^2."""
+        """Return the acceleration (d,), m/s^2, at time t (s)."""
         return self._within(self._of[0], t) * (t <= self.end)
 
     def _within(self, value: PPoly, t: float) -> NDArray[np.float64]:
-        """Return a value along the direction (d,), zero before the record, and after it what it has at its end."""
+        """Return a quantity (d,) along the direction: zero before the record, constant after it."""
         return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
 
 
 def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> PPoly:
-    """Return what is linear between values (n,) at times (n,), s."""
+    """Return the piecewise linear interpolant of values (n,) at times (n,), s."""
     return PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 

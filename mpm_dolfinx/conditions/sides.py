@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The sides of the bodies that conditions name."""
+"""Faces of the sides to which conditions apply."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Sides:
-    """Finds the faces of conditions, the same object for conditions on the same faces.
+    """Finder of the faces of conditions; conditions on the same faces share one object.
 
     Parameters
     ----------
     grid, bodies
         Background grid and all bodies of the scene.
     present
-        Which bodies are there.
+        Which bodies are present.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
@@ -38,12 +38,12 @@ class Sides:
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:
-        """Return the faces of a condition's side and region; ValueError where there are none."""
+        """Return the faces of a condition's side and region; ValueError if there are none."""
         found = self._of(condition.side, condition.region)
         if not len(found):
             where = " in the region" if condition.region is not None else ""
             where += " off the axis" if self.grid.has_axis else ""
-            raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
+            raise ValueError(f"{line(condition)}: no point has this side{where}, must be a side of a body")
         copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
@@ -59,18 +59,18 @@ class Sides:
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
-        """Return the faces at which a given displacement is imposed: not those of a cell that its region half leaves.
+        """Return the faces of a prescribed displacement, without cells that its region covers by at most one half.
 
-        The last node that is held carries half a cell beyond it.  So a region that reaches no farther than half of its
-        last cell is held up to this cell; aslant to the grid, up to half a cell before its end.  A region ends where
-        its side goes on and nothing else gives the same components.
+        The last prescribed node carries half a cell beyond it.  A region that covers at most half of its last cell
+        therefore ends at this cell; in a direction inclined to the grid it ends half a cell earlier.  This concerns
+        ends of regions at which the side continues and no other condition prescribes the same components.
 
         Parameters
         ----------
         condition
-            The given displacement.
+            The prescribed displacement.
         others
-            The other ones that give some of its components.
+            Other prescribed displacements with common components.
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X
@@ -83,7 +83,7 @@ class Sides:
         neighbours = [self.of(other).X for other in others]
 
         def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
-            """Return which boxes (m, 2, d) lie beside the faces, and reach beyond x along an axis on both sides."""
+            """Return which boxes (m, 2, d) are adjacent to the faces and reach across the coordinate x of an axis."""
             across = np.arange(d) != axis
             low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
             beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
@@ -99,20 +99,20 @@ class Sides:
                     box[end, axis] -= sign * self._beyond_nodes(side, at_end, axis, limit, sign)
         box[:, box[0] > box[1]] = faces.region[:, box[0] > box[1]]
         shorter = self._of(condition.side, box)
-        return shorter if len(shorter) else faces  # less than a cell wide
+        return shorter if len(shorter) else faces  # the region is narrower than a cell
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return how far, m, a region that ends at x along an axis of reference positions is not held, see `held`.
+        """Return the length, m, of the free end of a region that ends at x along an axis of reference positions.
 
-        at_end (m,): which faces of the side reach over x.
+        at_end (m,): which faces of the side reach across x.  See `held`.
         """
         faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
         slope, grid = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum(), self.grid
-        there = places.mean(axis=1)[0] + (x - X.mean(axis=1)[0]) * slope - grid.base  # the end
+        there = places.mean(axis=1)[0] + (x - X.mean(axis=1)[0]) * slope - grid.base  # seeded position of the end
         inner = there - sign * NEAR * grid.least / max(float(np.abs(slope).max()), TINY) * slope
-        slope = slope / (grid.h if grid.even else grid.sizes_at(inner[None])[0])  # of a map, cells over metres
+        slope = slope / (grid.h if grid.even else grid.sizes_at(inner[None])[0])  # derivative of the map, cells/m
         a = np.abs(slope).argmax()
         if np.abs(np.delete(slope, a)).max() > SAME * abs(slope[a]):
             return 0.5 / float(np.linalg.norm(slope))
@@ -124,7 +124,7 @@ class Sides:
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 
     def around(self, bodies: Sequence[int]) -> Surface:
-        """Return the faces on all sides of those of some bodies that are there, what lies on other bodies included."""
+        """Return the faces on all sides of some present bodies, including faces in contact with other bodies."""
         key = ("", np.array(bodies).tobytes())
         if key not in self._found:
             there = [bool(here) and i in bodies for i, here in enumerate(self.present)]
@@ -132,14 +132,14 @@ class Sides:
         return self._found[key]
 
     def all(self) -> Surface:
-        """Return the faces on all sides of all groups of bodies: what groups have on one another may part."""
+        """Return the faces on all sides of all contact groups, including faces between groups, which may separate."""
         start = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
         copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
 
 def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return what functions of the user's give on this process; raise on all what is raised on one."""
+    """Return values of user functions on this process; an error on one process is raised on all."""
     message, value = "", None
     try:
         value = ask()
@@ -151,7 +151,7 @@ def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np
 
 
 def on_side(patches: Patches, points: MaterialPoints) -> Places:
-    """Return what gives the places at which functions of the user's are asked on a side."""
+    """Return the function that gives the positions of quadrature points on a side to user functions."""
     return lambda name: patches.X if name == "X" else patches.now(points) + patches.base
 
 
@@ -165,14 +165,14 @@ def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, ND
 
 
 def check_apart(one, faces: Surface, other, others: Surface) -> None:
-    """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
+    """Raise an error if two mutually exclusive conditions share a part of a face."""
     first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
-    a, b = ranges(first, stop - first)  # all pairs of parts of one domain's faces
+    a, b = ranges(first, stop - first)  # all pairs of faces of the same domain
     same = faces.face[a] == others.face[b]
     a, b = a[same], b[same]
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
     size = faces.X[a, 1] - faces.X[a, 0]
-    common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # they lie across this axis
+    common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # or flat along the axis
     both = np.flatnonzero(common.all(axis=1))
     if len(both):
         x = (low[both[0]] + high[both[0]]) / 2
@@ -180,9 +180,9 @@ def check_apart(one, faces: Surface, other, others: Surface) -> None:
 
 
 def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.float64]:
-    """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
+    """Return the common corners (k, d), m, of faces of two conditions, at reference positions.
 
-    Bodies that a map has put elsewhere have corners in common with themselves only.
+    A mapped body has common corners with itself only.
     """
 
     def corners(faces: Surface) -> NDArray[np.float64]:

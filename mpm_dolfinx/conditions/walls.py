@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The forces of the grid's walls on the bodies, from those on the components of nodes that they hold."""
+"""Wall forces on the bodies, from the forces on fixed components of nodes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 def wall_forces(
     grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the forces (d,), N, of all walls by their names; on several processes all call it together.
+    """Return the forces (d,), N, of all walls by name; collective.
 
-    A component of a node that several walls hold is that of the wall across it, else they share it evenly.  The axis of
-    revolution has no surface: nothing acts on it across.
+    If several walls fix a component of a node, the wall normal to it takes the force; otherwise they share it evenly.
+    The axis of revolution has no area, so its radial force is zero.
 
     Parameters
     ----------
     walls
-        Walls with the components that they hold.
+        Walls and their fixed components.
     dofs : (n,)
-        Unrolled local degrees of freedom, each once or more often; of those that no wall holds forces do not count.
+        Unrolled local degrees of freedom, possibly repeated; free ones are ignored.
     forces : (n,), N
         Forces on them.
     """

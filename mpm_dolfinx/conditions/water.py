@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Free water against a side of the bodies: its pressure and its head on what it wets, a seepage face above."""
+"""Free water against a side of the bodies: pressure and head below its level, a seepage face above."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ def water(
     region: Region | None = None,
     unit_weight: float | None = None,
 ) -> tuple[Pressure, Drained]:
-    """Return the two conditions by which still water acts on a side: both are to be given.
+    """Return the two conditions of still water at a side; a scene needs both.
 
-    Below its level it presses on the side and is open to the pores, with the hydrostatic pressure; above, the side is
-    a seepage face.  Both follow the side as it moves, from step to step.
+    Below the level, hydrostatic pressure acts on the surface and on the pore fluid.  Above it the side is a seepage
+    face.  Both are updated with the motion of the side in each step.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     level : float or callable t (s) -> float, m
-        Height of the free surface, along the last axis; finite.
+        Height of the free surface along the last axis; finite.
     region : ((d,), (d,)), m
-        Box of reference positions to which the faces are limited.
+        Box of reference positions that limits the faces.
     unit_weight
-        Of the water, N/m^3, > 0; by default that of the scene's fluid.  That of the pores is the fluid's density times
-        the gravity of the scene: a warning says where they differ.
+        Unit weight of the water, N/m^3, > 0; by default that of the scene's fluid.  A warning reports a difference from
+        fluid density times gravity.
 
     Raises
     ------
     ValueError
-        Naming what is out of its range; of a function, at the step that asks for it.
+        A value out of range; for functions, in the step that needs the value.
     """
     if unit_weight is not None:
         numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
@@ -57,13 +57,13 @@ def water(
 
 @dataclass(frozen=True)
 class WaterPressure(OfWater):
-    """The pressure of free water, as a function of time and places; its unit weight by default that of the scene."""
+    """Pressure of free water as a function of time and position."""
 
     side: str
     level: float | Callable[[float], float]
     given: float | None = None
 
     def __call__(self, t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at places x (m, d)."""
+        """Return the pressures (m,), Pa, at positions x (m, d), m."""
         height = given(f"water at {self.side!r}: level at t = {t:g} s", self.level, t)
         return self.unit_weight * np.maximum(height - x[:, -1], 0.0)

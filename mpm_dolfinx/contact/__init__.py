@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Rigid tools and contact between groups of bodies."""
+"""Contact: rigid tools, and groups of bodies that slide and separate."""

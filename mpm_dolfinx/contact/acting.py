@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools, and contacts of groups of bodies, as conditions that act on the momentum: see `Acting`."""
+"""Rigid tools and contact groups as loads on the momentum, see `Acting`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Touching(Acting):
-    """What may touch the bodies, and part from them.
+    """Contact conditions of a stage: tools or groups.
 
     Parameters
     ----------
     setting, names, found
-        Where the conditions are put, their names, and what finds where they touch.
+        Setting of the stage, names of the conditions, and the finder of contact pairs.
     """
 
     linear = False
@@ -39,7 +39,7 @@ class Touching(Acting):
         self.symmetric = found.symmetric
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what n points keep of each condition: pressures and shear tractions."""
+        """Return the initial history of n points for each condition: pressures and shear tractions."""
         return self.found.kept(n)
 
     def by_name(self, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -47,7 +47,7 @@ class Touching(Acting):
         return dict(zip(self.names, rows, strict=True))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments of this value."""
+        """Return forces and moments, filled with this value."""
         return {"tool_forces": self.by_name(np.full((len(self.names), 3 if self._grid.dim == 2 else 6), value))}
 
 
@@ -57,7 +57,7 @@ class ToolsOfStage(Touching):
     Parameters
     ----------
     setting, tools
-        Where they are put, and the tools by name.
+        Setting of the stage, and its tools by name.
     """
 
     conditions, title = (Tool,), "tools"
@@ -69,7 +69,7 @@ class ToolsOfStage(Touching):
         self.outside = found.faces
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments of this value, and that nothing has pushed them."""
+        """Return forces and moments, filled with this value, zero displacements by loads, and initial velocities."""
         out, d = super().unknown(value), self._grid.dim
         tools = dict(zip(self.names, self.found.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -78,14 +78,14 @@ class ToolsOfStage(Touching):
         return out
 
     def _ways(self, place: Place) -> NDArray[np.float64]:
-        """Return how far loads had pushed them at the start of a step (tools,), m; with free tools (tools, d)."""
+        """Return displacements by loads before a step (tools,), m; with free tools (tools, d)."""
         gone = [place.before["tool_travel"][name] for name in self.names]
         if self.found.free:
             gone = [np.broadcast_to(way, (self._grid.dim,)) for way in gone]
         return np.array(gone, dtype=float)
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact with them."""
+        """Return the contact with the tools in a substep."""
         ways = self._ways(place)
         tools = self.found.going(Ways(place.start, place.t, ways, ways), place.start + place.dt * place.inertia)
         placed = tools, place.cut, place.points, ways, (place.start, place.t)
@@ -98,7 +98,7 @@ class ToolsOfStage(Touching):
         return FreeToolLoads(*placed, mass=self.found.masses, guides=self.found.guides, **options)
 
     def check_start(self, place: Place) -> None:
-        """Refuse tools that begin in bodies."""
+        """Raise an error if tools begin inside bodies."""
         ways = self._ways(place)
         self.found.going(Ways(place.start, place.start, ways, ways)).check_start(place.cut, place.points, place.start)
 
@@ -109,7 +109,7 @@ class ContactsOfStage(Touching):
     Parameters
     ----------
     setting, contacts
-        Where they are put, and the contacts by name.
+        Setting of the stage, and its contacts by name.
     """
 
     conditions, title = (Contact,), "contacts"
@@ -119,11 +119,11 @@ class ContactsOfStage(Touching):
         super().__init__(setting, tuple(contacts), found)
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact of the groups."""
+        """Return the contact between groups in a substep."""
         return ContactLoads(self.found, place.cut, place.points)
 
     def check_start(self, place: Place) -> None:
-        """Refuse groups that begin in each other."""
+        """Raise an error if groups overlap at the start."""
         self.found.check_start(place.cut, place.points, place.start)
 
 
@@ -133,9 +133,9 @@ class ToolLoads(ContactProblem):
     Parameters
     ----------
     tools, cut
-        The tools as they go, and the domains.
+        Tools with their motion in the step, and cut particle domains.
     before, times
-        How far loads had pushed tools (tools,), m; the times, s, at the start and at the end.
+        Displacements by loads before the step (tools,), m; start and end time, s.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class ToolLoads(ContactProblem):
         return Gone(self.shares.own, self.pairs.poses)
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """See `ContactProblem`: as the method has it from where the tools are in both substeps."""
+        """See `ContactProblem`: by the time integration, from the positions of the tools in both substeps."""
         pairs = self.pairs
         gone = pairs.carried - pairs.now
         if self._gone is not None:
@@ -172,7 +172,7 @@ class ToolLoads(ContactProblem):
         return gone / self.shares.own
 
     def ended(self, at: At) -> Loads:
-        """Return the contact with the tools as they have gone."""
+        """Return the contact with the tools at their final positions."""
         out = copy(self)
         out._tools = self._tools.going(Ways(*self._times, self._before, self._before + self.found(at).travel))
         return out
@@ -184,26 +184,26 @@ class ToolLoads(ContactProblem):
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return corners with those that are in tools put out."""
+        """Return corners without penetration of tools."""
         return self._tools.outside(corners, self._times[1], free, np.inf if everywhere else NEAR)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse a step in which tools have passed bodies, or after which they are in bodies."""
+        """Raise an error if tools have passed through bodies, or lie inside them."""
         start, t = self._times
         self._tools.check_end(self._cut, points, t, before, start)
 
 
 class FreeToolLoads(FreeTools, ToolLoads):
-    """Contact with tools some of which are free."""
+    """Contact with tools, some of them free."""
 
 
 class ContactLoads(ContactProblem):
-    """Contact of groups, whose pairs follow the bodies.
+    """Contact between groups; the pairs follow the bodies.
 
     Parameters
     ----------
     contacts, cut, points
-        The contacts, the domains, and the points where they are now.
+        Contacts, cut particle domains, and present points.
     """
 
     def __init__(self, contacts: Contacts, cut: CutDomains, points: MaterialPoints):
@@ -212,9 +212,9 @@ class ContactLoads(ContactProblem):
         self._contacts, self._cut = contacts, cut
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners are beside other groups."""
+        """Return which corners are near other groups."""
         return self._contacts.near(self._cut, points, corners)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse groups that are in each other."""
+        """Raise an error if groups overlap."""
         self._contacts.check_end(self._cut, points, before)

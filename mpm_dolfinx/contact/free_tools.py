@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Tools with a mass: weight, loads and what they touch move them, and what moves goes on moving.
+"""Free tools: rigid tools with mass, moved by weight, loads and contact forces.
 
-A tool of mass m goes by q in a step, as nodes go by u (`mechanics/inertia.py`):  m (q - q^) / (own dt)^2 = l - sum f,
-q^ its free flight, l what pushes it, f the forces on the points that it touches.  q is condensed: with minus the
-derivative D of f by the way of the points, and S = sum D + m / (own dt)^2, Newton's method goes on by
+The displacement q of a tool of mass m in a step follows m (q - q^) / (own dt)^2 = l - sum f, as for nodes
+(`mechanics/inertia.py`).  Here q^ is its free flight, l its load, and f are the contact forces on the points.  q is
+condensed.  Let D be minus the derivative of f by the displacement of the points, S = sum D + m / (own dt)^2, and dw
+their increment.  Newton's method then gives
 
     dq = S^-1 (l - sum f - m (q - q^) / (own dt)^2 + sum D dw),
 
@@ -26,9 +27,10 @@ from mpm_dolfinx.mechanics.inertia import Flight
 
 
 class Goes(NamedTuple):
-    """How free tools go on from w (m, d), m: travel + shift (k, d), m, and by the inverse (k, d, d) of S beyond.
+    """Linearised motion of free tools at w (m, d), m: displacement travel + shift (k, d), m, plus inverse (k, d, d) of
+    S times further forces.
 
-    found: the contact at w.
+    found: contact at w.
     """
 
     w: NDArray[np.float64]
@@ -39,8 +41,8 @@ class Goes(NamedTuple):
 
 
 class Met(NamedTuple):
-    """How free tools meet the forces on them: inverse (k, d, d) of S; off (k,), what is out of balance, of the forces;
-    shift (k, d), m, how far to go.
+    """Equation of motion of free tools: inverse (k, d, d) of S; off (k,): relative out-of-balance force; shift (k, d):
+    Newton increment, m.
     """
 
     inverse: NDArray[np.float64]
@@ -49,16 +51,16 @@ class Met(NamedTuple):
 
 
 class FreeTools(ContactProblem):
-    """What loads of tools are beside, where some of these are free.
+    """Mixin of `ToolLoads` for scenes with free tools.
 
     Parameters
     ----------
     placed
-        As `ToolLoads` takes it.
+        Arguments of `ToolLoads`.
     mass, guides
-        Of the tools (k,), kg, 0 of those that are not free; projections (k, d, d) on the ways that they may go.
+        Masses (k,), kg, 0 for tools that are not free; projections (k, d, d) on their directions of motion.
     velocity, pushes
-        At the start of the step (k, d), m/s; loads (k, d), N.
+        Velocities (k, d), m/s, at the start of the step; loads (k, d), N.
     """
 
     couples = True
@@ -68,7 +70,7 @@ class FreeTools(ContactProblem):
         self._mass, self._guides = mass, guides
         self._pushes = pushes
         self.flight = Flight(velocity, velocity)
-        """Velocities of the tools (k, d), m/s, and their accelerations, when the substep begins."""
+        """Velocities and accelerations of the tools (k, d), m/s and m/s^2, at the start of the substep."""
         self._rate, self._free = 0.0, np.zeros_like(velocity)
 
     def begun(self, shares: Shares, gone: Gone | None) -> FreeTools:
@@ -92,7 +94,7 @@ class FreeTools(ContactProblem):
         return np.where(free, self._after(at).velocity[self.pairs.number], super().tool_velocity(at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`: what bodies take from a free tool changes its energy; what pushes it brings work."""
+        """See `Loads`: contact forces change the energy of a free tool, and loads do work on it."""
         rubs, more = super().rubbing(at, v)
         free = (self._mass > 0)[self.pairs.number]
         more -= float((self.found(at).touch.force * self.tool_velocity(at))[free].sum())
@@ -109,14 +111,14 @@ class FreeTools(ContactProblem):
 
     def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
         found = super()._find_at(w, way)
-        if way.ndim == 1:  # before the substep begins
+        if way.ndim == 1:  # before the first substep
             return found
         law = self.now.law
         shift = self._met(found).shift[self.pairs.number]
         return found._replace(balanced=found.touch.force + law.slope(found.touch, found.at, shift))
 
     def _travel(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far tools go (k, d), m, at w (m, d), m: along the line of the last Newton step."""
+        """Return the displacements (k, d), m, of tools at w (m, d), m, along the last Newton step."""
         goes = self.now.ways
         law = self.now.law
         moved = law.slope(goes.found.touch, goes.found.at, w - goes.w)
@@ -126,13 +128,13 @@ class FreeTools(ContactProblem):
         return goes.travel + goes.shift + np.einsum("kij,kj->ki", goes.inverse, on[:, 1:])
 
     def _goes(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Goes:
-        """Return how tools go on from a travel (k, d), m, where the bodies are at w (m, d), m."""
+        """Return the linearised motion of tools with displacements (k, d), m, for bodies at w (m, d), m."""
         found = self._find_at(w, travel)
         met = self._met(found)
         return Goes(w, travel, met.shift, met.inverse, found)
 
     def _met(self, found: Found) -> Met:
-        """Return how tools meet the forces on them."""
+        """Return the equation of motion of the tools at a contact."""
         law = self.now.law
         of, d = self.pairs.number, self.grid.dim
         columns = [law.slope(found.touch, found.at, self._guides[of, :, i]) for i in range(d)]
@@ -150,7 +152,7 @@ class FreeTools(ContactProblem):
         return Met(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 
     def pattern(self, unknowns) -> PETSc.Mat | None:
-        """See `Loads`: nodes under a free tool are coupled."""
+        """See `Loads`: all nodes under a free tool are coupled."""
         out = None
         for number in np.flatnonzero(self._mass > 0):
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
@@ -182,9 +184,9 @@ class FreeTools(ContactProblem):
         self.now = self.now._replace(ways=self._goes(w, travel))
         return changed
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
-        """See `Loads`: tools as well are to be in balance."""
-        if super().augment(at, unknown):
+    def augment(self, at: At) -> bool:
+        """See `Loads`: tools must be in equilibrium too."""
+        if super().augment(at):
             return True
         found = self.found(at)
         met = self._met(found)
@@ -194,7 +196,7 @@ class FreeTools(ContactProblem):
         return True
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`: also velocities (d,), m/s."""
+        """See `Loads`: with velocities (d,), m/s."""
         out = super().outcome(at)
         for k in np.flatnonzero(self._mass == 0):
             out["tool_travel"][self.now.law.names[k]] = np.array(0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which bodies touch which others without sticking: groups of bodies, each with a copy of the grid."""
+"""Groups of bodies that touch without sticking: each group has its own copy of the grid."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from mpm_dolfinx.grid.grid import Grid, GridOfGroups
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Two groups of bodies that touch, slide and part.
+    """Two groups of bodies in contact, with slip and separation.
 
-    Bodies of one group stick where they touch; groups do not pass into each other, and what parts is free.  Where they
-    touch no fluid passes.  Where there are contacts all bodies are in groups, and every two groups have one contact.
-    The forces on the bodies of `one` are in the simulation's `tool_forces`.
+    Bodies of one group stick where they touch.  Groups do not penetrate each other, and may separate.  No fluid passes
+    between them.  In a scene with contacts each body belongs to a group, and each two groups have one contact.  The
+    simulation's `tool_forces` are forces on the bodies of `one`.
 
     Parameters
     ----------
@@ -30,14 +30,14 @@ class Contact:
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Shear stress that the contact takes besides, Pa, >= 0, as of a `Tool`.
+        Additional shear strength of the contact, Pa, >= 0, as for a `Tool`.
     name
-        By which its results are found; without, "contact".
+        Name of its results; by default "contact".
 
     Raises
     ------
     ValueError
-        What is none that is allowed; from the scene: groups that share bodies, or that have no contact.
+        An invalid value.  From the scene: groups with common bodies, or without a contact.
     """
 
     one: int | Sequence[int]
@@ -57,7 +57,7 @@ class Contact:
         return self.friction > 0 or self.adhesion > 0
 
     def groups(self, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the two groups, of a scene of so many bodies."""
+        """Return the two groups, for a scene of `count` bodies."""
         allowed = f"indices of the bodies, 0 to {count - 1}"
         found = []
         for name in ("one", "other"):
@@ -78,7 +78,7 @@ class Contact:
 
 
 def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
-    """Return the groups of a scene of so many bodies, by their first bodies; ValueError where they are none."""
+    """Return the groups of a scene of `count` bodies, sorted by their first bodies; ValueError for invalid groups."""
     pairs = [contact.groups(count) for contact in contacts]
     groups = sorted({group for pair in pairs for group in pair})
     for one, other in combinations(groups, 2):
@@ -101,19 +101,19 @@ def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
 def grouped(
     grid: Grid, bodies: Sequence[Body], conditions: Sequence[Any], quadrature: str, other: dict[str, Any]
 ) -> Grid:
-    """Return the grid of a scene: with contacts, one with a copy for each group.
+    """Return the grid of a scene; with contacts, a grid with a copy for each group.
 
     Parameters
     ----------
     conditions, quadrature
         See `Simulation`.
     other
-        What scenes with contacts cannot have, by name.
+        Parts that a scene with contacts must not have, by name.
 
     Raises
     ------
     ValueError
-        Contacts that are none, or do not go together with what else the scene has.
+        Invalid contacts, or contacts that other parts of the scene exclude.
     """
     contacts = contacts_of(conditions)
     if not contacts:
@@ -126,7 +126,7 @@ def grouped(
         if value is not None and not (isinstance(value, Sequence) and not len(value)):
             raise ValueError(f"{name}: must be none with contacts")
     if not grid.even:
-        raise ValueError("contacts: must be none on a grid whose cells have many sizes")
+        raise ValueError("contacts: must be none on a grid of unequal cells")
     group = np.zeros(len(bodies), dtype=np.int64)
     for number, members in enumerate(groups_of(contacts, len(bodies))):
         group[list(members)] = number

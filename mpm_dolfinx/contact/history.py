@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contact pressures and shear tractions that material points keep from step to step."""
+"""Contact history of material points: pressures and shear tractions from step to step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Rough(Protocol):
-    """A tool, or the contact of two groups: mu, adhesion, Pa, and whether it resists slip."""
+    """Strength of a tool or contact: mu, adhesion, Pa, and whether it resists slip."""
 
     friction: float
     adhesion: float
@@ -24,17 +24,17 @@ class Rough(Protocol):
 
 
 def pressure_name(name: str) -> str:
-    """Return the name under which points have the pressure (n,), Pa, of a tool or contact on their faces."""
+    """Return the name of the point field with the pressure (n,), Pa, of a tool or contact."""
     return f"{name}_pressure"
 
 
 def shear_name(name: str) -> str:
-    """Return the name under which points keep the shear traction (n, d), Pa, of a tool or contact."""
+    """Return the name of the point field with the shear traction (n, d), Pa, of a tool or contact."""
     return f"{name}_shear"
 
 
 def kept(contacts: Mapping[str, Rough], n: int, dim: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Return what n points keep of each contact, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
+    """Return zero histories of n points for each contact: pressures (n,) and, if it resists slip, tractions (n, d)."""
     return {
         name: {pressure_name(name): np.zeros(n), **({shear_name(name): np.zeros((n, dim))} if contact.grips else {})}
         for name, contact in contacts.items()
@@ -42,14 +42,14 @@ def kept(contacts: Mapping[str, Rough], n: int, dim: int) -> dict[str, dict[str,
 
 
 def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
-    """Return points without what they keep under these names."""
+    """Return points without the fields of these names."""
     return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
 
 
 def gripped(
     points: MaterialPoints, new: Mapping[str, NDArray[np.float64]], before: MaterialPoints | None
 ) -> MaterialPoints:
-    """Return points with new data, or with what the same points kept of it `before`."""
+    """Return points with new fields, where points present `before` keep their values."""
     if before is not None:
         here, at = before.find(points.id)
         for name in new.keys() & before.data.keys():
@@ -59,9 +59,9 @@ def gripped(
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where pairs come from: their way to the owners of their cells, and of each (n,) before it the material point.
+    """Origin of contact pairs: their exchange to the owners of cells, and data (n,) before this exchange.
 
-    point : (n,) index on this process; number : (n,) contact; area : (n,), m^(d-1).
+    point (n,): index of the material point on this process; number (n,): contact; area (n,): m^(d-1).
     """
 
     travel: Exchange
@@ -72,7 +72,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with the means of the pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
+        """Return the points with mean pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
         push = self.travel.back(push)
         shear = self.travel.back(shear)
         data = dict(points.data)

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Contact pressure, Coulomb friction and adhesion by conditions, one a contact and cell.
+"""Contact law: pressure, Coulomb friction and adhesion, with one condition for each contact and cell.
 
-The contact pressure at a place with the gap g, and its energy by area, are
+The contact pressure at a place with gap g, and its energy per area, are
 
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
-k is no stiffer than lets a Q1 field follow curved surfaces, to which their places ask for more than it has nodes;
-lambda, one value a contact and cell, is at first the pressure of the step before, and augmented (Uzawa) until the
-cells' surfaces penetrate by less than `DEPTH` in the mean.  Friction acts on the mean slip s of the cell in the step,
-from the traction t_n of the step before, which the points keep,
+The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier lambda has one value for each
+contact and cell.  It starts from the pressure of the previous step, and is augmented (Uzawa) until the mean penetration
+of each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step, and on the traction t_n of
+the points after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
-P the projection on the tangent plane: what sticks is elastic with a stiffness k_t, and gives back what it took.
-What slips is chosen after each Newton step (active sets): at first all sticks, whatever it would bear; what slips back
-sticks again, as soon as the balance is near, and then for as long.  Decided in each residual anew all would slip to and
-fro, for there is no stiffness in slip.  What sticks and leaves slips as well, the second time for good: where the mean
-normal of a cell leans, under round tools that just touch, shear alone would push the surface away, to and fro.
+with the projection P on the tangent plane.  Sticking contact is elastic with stiffness k_t.
+
+The slipping set is updated after Newton steps (active set).  Updates in each residual would make cells chatter, because
+slip has no stiffness.  All cells start in stick, at any traction.  A cell with reversed slip returns to stick, and may
+then slip again, only near equilibrium.  A sticking cell that opens slips afterwards, the second time for good.  Under a
+round tool at first contact the mean normal is inclined, and shear alone would open and close the contact.
 """
 
 from __future__ import annotations
@@ -39,26 +40,26 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""k in units of (what resists) / (cell size)."""
+"""k in units of (resistance) / (cell size)."""
 GRIP = 6.0
-"""k_t in units of (what resists) / (cell size): stiffer shears alternate from cell to cell, which displaces no node."""
-DEPTH = 5e-4  # cells: mean penetration that is left
-TOUCH = 1e-13  # of the grid: what is nearer touches, but for rounding; light bodies press no deeper than 1e-8 cells
-SLIVER = 0.25  # of a cell's face: of what is smaller less penetration counts
-ROUNDS = 20  # augmentations that are tried
+"""k_t in units of (resistance) / (cell size): stiffer shears alternate from cell to cell without moving nodes."""
+DEPTH = 5e-4  # cells: allowed mean penetration
+TOUCH = 1e-13  # of the grid: gap of contact within rounding; light bodies penetrate less than 1e-8 cells
+SLIVER = 0.25  # of a cell's face: smaller contact areas count with less penetration
+ROUNDS = 20  # largest number of augmentations
 SLOW, STIFFER = 0.6, 10.0
-"""Where a round leaves more than this share of the penetration, k is made so many times larger."""
-RAMP = 10.0  # adhesion over the normal pressure, at most
+"""k is multiplied by STIFFER if an augmentation leaves more than the share SLOW of the penetration."""
+RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """What iterations change of k conditions, beside the displacements.
+    """State of the iterations for k conditions, except for displacements.
 
-    pressure : (k,) lambda, Pa; slip : (k, d) direction of the shear of what slips, else zero; resticks : (k,) what has
-    slipped, and stuck again; parts : (k,) and then has left; stuck : (k, d) traction, Pa, of what stuck at the last
-    choice; raised : by how much k has been; off : penetration, cells, of the last round; rounds : of augmentation;
-    follows : how often pairs have been found anew.
+    pressure (k,): lambda, Pa; slip (k, d): direction of slip, zero in stick; resticks (k,): whether slip returned to
+    stick; parts (k,): and opened again afterwards; stuck (k, d): traction in stick at the last update, Pa; raised:
+    factor of k; off: penetration after the last augmentation, cells; rounds: number of augmentations; follows: number
+    of pair updates.
     """
 
     pressure: NDArray[np.float64]
@@ -79,12 +80,12 @@ class ContactState:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """The contact at some displacement: of m pairs, and of k conditions.
+    """Contact at some displacement: of m pairs, and of k conditions.
 
-    force : (m, d) on the points, N; push : (m,) pressure, Pa; stiff : (m,) minus its derivative by the gap, Pa/m;
-    pressure : (k,) mean of the pressure, Pa; sticks : (k,) what touches, and does not slip; trial, shear : (k, d)
-    traction if all stuck, and as it is, Pa; most : (k,) what it may be, Pa; grip : (k, d, d) minus its derivative by
-    the slip, Pa/m; rise : (k, d) that by the pressure.
+    force (m, d): on the points, N; push (m,): pressure, Pa; stiff (m,): minus its derivative by the gap, Pa/m; pressure
+    (k,): mean pressure, Pa; sticks (k,): whether in contact and stick; trial, shear (k, d): traction in stick, and
+    actual traction, Pa; most (k,): shear strength, Pa; grip (k, d, d): minus derivative of the traction by slip, Pa/m;
+    rise (k, d): its derivative by pressure.
     """
 
     force: NDArray[np.float64]
@@ -100,14 +101,14 @@ class Touch:
 
 
 class ContactLaw:
-    """The conditions of contacts in a substep.
+    """The contact conditions of a substep.
 
     Parameters
     ----------
     names, contacts
-        The contacts.
+        Names of the contacts, and the contacts.
     pairs
-        What may touch.
+        Possible contact pairs.
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
@@ -117,7 +118,7 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Contact and cell (k,) of the conditions, in one number."""
+        """Contact and cell of the conditions (k,), in one number."""
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
         self.strength = strength[key // self.grid.num_local]
@@ -127,7 +128,7 @@ class ContactLaw:
         self.grips = any(contact.grips for contact in contacts)
 
     def begins(self) -> ContactState:
-        """Return the state in which iterations begin: the pressures of the step before, and all sticks."""
+        """Return the initial state: pressures of the previous step, all in stick."""
         k, d = len(self.key), self.grid.dim
         none = np.zeros(k, dtype=bool)
         return ContactState(self.mean(self.pairs.pressure), np.zeros((k, d)), none, none, np.zeros((k, d)))
@@ -140,7 +141,7 @@ class ContactLaw:
         return out.reshape(size, *values.shape[1:])
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means (k, ...) over the area of values (m, ...) in the conditions."""
+        """Return the area-weighted means (k, ...) of values (m, ...) in the conditions."""
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
@@ -149,7 +150,7 @@ class ContactLaw:
         return state.raised * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
-        """Return the contact of the pairs where they are."""
+        """Return the contact of the pairs at a geometry."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
         touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
@@ -163,14 +164,14 @@ class ContactLaw:
         return Touch(force, push, stiffness * touches, pressure, *friction)
 
     def _friction(self, state: ContactState, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
-        """Return what a `Touch` has from `sticks` on; n, slip : (k, d), normals and means."""
+        """Return the fields of `Touch` from `sticks` on; n, slip (k, d): mean normals and slips, m."""
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips
         trial = np.einsum("kij,kj->ki", P, self.mean(self.pairs.shear) * on[:, None] - hold[:, None] * slip)
         size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
-        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # what turns back keeps its shear for now
+        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until an update
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
         turns = hold * np.where(slips, onward * most / size, 1.0)
         grip = turns[:, None, None] * (P - along[:, :, None] * along[:, None, :])
@@ -179,7 +180,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, rise
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return minus the derivative D (m d, m d) of the forces by w; that shears turn is left out."""
+        """Return minus the derivative D (m d, m d) of the forces by w, without the rotation of shears."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -190,7 +191,7 @@ class ContactLaw:
         D = scipy.sparse.bsr_matrix((own, np.arange(m), np.arange(m + 1)), shape=(m * d, m * d)).tocsr()
         if not self.grips:
             return D
-        # means over the conditions, of displacements and of pressures
+        # means over conditions, of displacements and of pressures
         share = pairs.area / self.area[self.of]
         mean = scipy.sparse.csr_matrix((share, (self.of, np.arange(m))), shape=(len(self.area), m))
         wide = scipy.sparse.kron(mean, scipy.sparse.identity(d), format="csr")
@@ -218,7 +219,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Choose what slips, and if asked for what sticks again; return the state, and whether the choice is new."""
+        """Update the slipping set and, if sticks, returns to stick; return the state and whether the set changed."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -235,11 +236,11 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, x: NDArray[np.float64]) -> ContactState:
-        """Return the state with the present pressures for lambda; the same where means penetrate little enough.
+        """Return the state with the present pressures as lambda; unchanged if mean penetrations are small enough.
 
-        x : (m, d), m, where the points are.  Raises NotConverged after as many rounds as are tried.
+        x (m, d): positions of the points, m.  Raises NotConverged after ROUNDS augmentations.
         """
-        # what is a sliver of a cell has too little area to be pushed out by itself, and goes with its neighbours
+        # slivers of cells cannot correct their penetration alone, and follow their neighbours
         plane = self.total(self.pairs.area / self.grid.around(x))
         whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.key % self.grid.num_local)))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
@@ -250,31 +251,31 @@ class ContactLaw:
             number = self.key // self.grid.num_local
             worst = np.flatnonzero(off == most)[:1]
             where = [f"{line(self.contacts[number[k]])}: at {x[self.of == k][0] + self.grid.base}" for k in worst]
-            message = f"{''.join(where)} penetrates by {most:.2g} cells: does a wall hold the body there?"
+            message = f"{''.join(where)} penetrates by {most:.2g} cells: does a wall fix the body there?"
             raise NotConverged(first(self.grid.comm, message if where else ""))
-        # fluid, or what hardly changes its volume, resists more than k
+        # fluid, or a nearly incompressible body, is stiffer than k
         raised = state.raised * (STIFFER if most > SLOW * state.off else 1.0)
         return replace(state, pressure=touch.pressure, raised=raised, off=most, rounds=state.rounds + 1)
 
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
-        """Return what rounding of coordinates makes of the forces (m,), N, of the pairs."""
+        """Return the rounding errors of the forces (m,), N, of the pairs."""
         return self.rounding_of_gap * self.stiffness(state) * self.pairs.area
 
     @property
     def rounding_of_gap(self) -> NDArray[np.float64] | float:
-        """What rounding of coordinates makes of gaps, m; of the pairs (m,), or of all."""
+        """Rounding error of gaps, m; for each pair (m,), or for all."""
         return 4 * EPSILON * self.pairs.reach
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (contacts, ...) of values (m, ...) over each contact, of all processes."""
+        """Return the sums (contacts, ...) of values (m, ...) over each contact; collective."""
         columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
         sums = np.stack([sum_by(self.pairs.number, column, len(self.contacts)) for column in columns], axis=1)
         return over_all(self.grid.comm, sums).reshape(len(self.contacts), *values.shape[1:])
 
     def forces(self, touch: Touch, at: Geometry) -> NDArray[np.float64]:
-        """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m, of all processes.
+        """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m; collective.
 
-        In axisymmetry moments are zero, and the radial force is the sum of what acts outward.
+        In axisymmetry moments are zero, and the radial force is the sum of outward forces.
         """
         force, arm = self.pairs.sign[self.pairs.number, None] * touch.force, at.arm * (not self.grid.axisymmetric)
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
@@ -283,7 +284,7 @@ class ContactLaw:
     def tractions(self, touch: Touch) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        What sticks keeps how it differs from the mean of its cell: averaged anew in every step it would creep.
+        Pairs in stick keep their deviation from the mean of the cell, because repeated averaging would cause creep.
         """
         old = self.pairs.shear
         off = (old - self.mean(old)[self.of]) * touch.sticks[self.of, None]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The contacts of groups of a stage: which places on their surfaces face one another, and what points keep of it.
+"""Contacts of groups in a stage: opposite places on their surfaces, and the contact history of points.
 
-The contact itself is in `problem`.
+The contact equations are in `problem`.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 REACH = 2.0
-"""Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""
+"""Cells: largest gap that may close in a step; steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Cells: what is farther apart will not touch before pairs are found anew."""
+"""Cells: larger gaps do not close before the next pair update."""
 DEEP = 0.25
-"""Cells: what is deeper is behind a thin body."""
+"""Cells: deeper places are behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
-"""Nearest points of the other surface whose faces are tried."""
+"""Number of nearest points on the other surface whose faces are tried."""
 BESIDE = 0.6
-"""Cells from points on the other surface: corners that are nearer go with it."""
+"""Cells: corners within this distance of points on the other surface follow the Q1 field."""
 PLACES = 1 << 32
-"""More than a process has points of integration on a surface."""
+"""Upper bound of a process's quadrature points on a surface."""
 
 
 class Facets(NamedTuple):
-    """Points on the faces of the other group, those of all processes; arrays over n of them.
+    """Quadrature points on the faces of the other group, from all processes; arrays over n points.
 
-    x : (n, d), m; face : (n,) row of the `Surface`; cell : (n,) lexicographic; resistance : (n,), Pa;
-    corners, cut : (n, 2^(d-1), d), m, of the face at present and when the grid was reset; outward : (n, d) unit normal.
+    x (n, d): m; face (n,): row of the `Surface`; cell (n,): lexicographic number; resistance (n,): Pa; corners, cut
+    (n, 2^(d-1), d): corners of the face at present and at the last grid reset, m; outward (n, d): unit normal.
     """
 
     x: NDArray[np.float64]
@@ -68,10 +68,10 @@ class Facets(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Points of one surface that face the other; arrays over m pairs.
+    """Points of one surface, and opposite places on the other; arrays over m pairs.
 
-    row : (m,) point among the patches of this process; facet : (m,) one of the `Facets` on the face that it meets;
-    t : (m, 2) where on the face; gap : (m,), m, along the point's normal.
+    row (m,): point among the patches of this process; facet (m,): one of the `Facets` on the opposite face; t (m, 2):
+    coordinates on this face; gap (m,): distance along the point's normal, m.
     """
 
     row: NDArray[np.int64]
@@ -86,11 +86,11 @@ class Contacts:
     Parameters
     ----------
     sides
-        The sides of the bodies.
+        Finder of the sides of the bodies.
     materials
-        Those of the scene.
+        Materials of the scene.
     contacts
-        The contacts by name.
+        Contacts by name.
     """
 
     def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Mapping[str, Contact]):
@@ -102,7 +102,7 @@ class Contacts:
             both = contact.groups(len(sides.bodies))
             faces = [sides.around(group) for group in both]
             whole = [_extent([sides.bodies[i] for i in group]) for group in both]
-            swap = whole[1] < whole[0]  # the same in all stages, and in any order of the bodies
+            swap = whole[1] < whole[0]  # equal in all stages, for any order of the bodies
             self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
             signs.append(-1.0 if swap else 1.0)
         self._signs = np.array(signs)
@@ -115,11 +115,11 @@ class Contacts:
         return not any(contact.grips for contact in self.contacts)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what n points keep of the contacts, zero."""
+        """Return zero contact histories of n points."""
         return kept(dict(zip(self.names, self.contacts, strict=True)), n, self.grid.dim)
 
     def placed(self, cut: CutDomains, points: MaterialPoints) -> tuple[ContactLaw, Origin, Callable, Callable]:
-        """Return the contact in a step, with the points where they are at its start, as `ContactProblem` takes it."""
+        """Return the arguments of `ContactProblem` for a step, with the points at its start."""
         found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
         reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
         begun = self._law(cut, points, found, cut.points, points, reach)
@@ -140,9 +140,9 @@ class Contacts:
         there: MaterialPoints,
         reach: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the conditions of pairs that were found with the points as `seen`, with these now `there`.
+        """Return the contact law of pairs that were found at `seen`, with points that are now `there`.
 
-        points: at the start of the step, with the pressures and shears of then.
+        points: at the start of the step, with the contact history.
         """
         grid = self.grid
         d = self.grid.dim
@@ -189,13 +189,13 @@ class Contacts:
         )
 
     def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
-        """Return for each contact what `_met` does."""
+        """Return the facets and pairs of each contact, see `_met`."""
         return [self._met(cut, *faces, points) for faces in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of lexicographic cells (m,), first * cells + second, that pairs of a step may be in.
+        """Return all pairs of lexicographic cells (m,), first * cells + second, that pairs may occupy in the step.
 
-        Those of the pairs found at its start, and all that are next to each other.
+        These are the cells of the initial pairs, and all neighbouring cells.
         """
         grid = self.grid
         keys = []
@@ -214,7 +214,7 @@ class Contacts:
         return np.unique(np.concatenate(keys))
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
-        """Return points on faces of all processes, with the points where they are."""
+        """Return points on faces of all processes, at the present positions of the points."""
         patches, d = cut.surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.here]]
         now, then = (
@@ -233,14 +233,14 @@ class Contacts:
         return Facets(x, *whole.T, resists[:, 0], now.reshape(shape), then.reshape(shape), outward)
 
     def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
-        """Return the points on the faces of the other group, and which of these the points on the faces meet."""
+        """Return the facets of the other group, and the pairs between points on the faces and these facets."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         count = min(CANDIDATES[d], len(facets.x))
-        if not count:  # bodies of the other group are not there
+        if not count:  # the bodies of the other group are absent
             none = np.zeros(0, dtype=np.int64)
             return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
         reach = REACH * self.grid.h.min() + self.grid.h.max()
@@ -261,16 +261,16 @@ class Contacts:
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) just under places x (m, d) on faces that hold a part of these, else of their facets."""
+        """Return the cells (m,) just inside faces at places x (m, d), if they hold a part of the face, else its own."""
         grid, inside = self.grid, x - NEAR * self.grid.h.min() * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains are beside another group: these follow the Q1 field alone.
+        """Return which corners (n, 2^d, d) of domains are near another group and follow the Q1 field alone.
 
-        points: as they were at the start of the step.
+        points: at the start of the step.
         """
         out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.h.max()
         for pair in self._faces:
@@ -282,12 +282,12 @@ class Contacts:
         return out
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse a step in which groups may have passed into each other unseen, or have.
+        """Raise an error if groups overlap after a step, or may have passed through each other in it.
 
         Raises
         ------
         NotConverged
-            Saying where; a shorter step may do.
+            With the place; a shorter step may succeed.
         """
         h, comm = self.grid.h.min(), self.grid.comm
         moved = points.corners - before.corners
@@ -302,12 +302,12 @@ class Contacts:
             raise NotConverged(message)
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Refuse groups that are in each other as a stage begins at time t (s)."""
+        """Raise an error if groups overlap at the start of a stage at time t (s)."""
         if message := self._too_deep(cut, points):
-            raise ValueError(f"{message}, at t = {t:g} s as it begins, must touch or be apart")
+            raise ValueError(f"{message}, at the start t = {t:g} s, must touch or be apart")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
-        """Return where groups are too deep in each other, and how deep; nothing where they are not."""
+        """Return a message with the depth and place of an overlap of groups, "" if there is none."""
         h, comm = self.grid.h.min(), self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
             _, pairs = self._met(cut, faces, others, points)
@@ -315,34 +315,34 @@ class Contacts:
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
                 where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
-                return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
+                return f"{line(contact)}: bodies overlap by {-deepest / h:.3g} cells at {where}"
         return ""
 
 
 def _extent(bodies: Sequence[Body]) -> tuple:
-    """Return what orders groups of bodies by their surfaces, and equal ones by where they are seeded."""
+    """Return a sort key of a group of bodies: its surface area, then its seeded extent."""
     area = surface(bodies, None).area0.sum()
     corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
     return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return tractions (m, d) turned by the least angle into the planes with normals n (m, d)."""
+    """Return tractions (m, d), rotated by the smallest angle into the planes with normals n (m, d)."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 
 def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the places (m, d) at coordinates t (m, 2), from 0 to 1, on faces (m, 2^(d-1), d)."""
+    """Return the positions (m, d) at coordinates t (m, 2) in [0, 1] on faces (m, 2^(d-1), d)."""
     if corners.shape[2] == 2:
         return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
     return np.einsum("mk,mkd->md", weights(t), corners)
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where lines from x (m, d) along n meet faces (m, 2^(d-1), d), in their coordinates (m, 2), and how far."""
-    if corners.shape[2] == 2:  # as in `Faces`, a unit of length wide along a third axis
+    """Return coordinates (m, 2) and distances (m,) where lines from x (m, d) along n meet faces (m, 2^(d-1), d)."""
+    if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])
     off = np.einsum("mkd,md->mk", corners - x[:, None], n)

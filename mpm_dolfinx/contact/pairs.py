@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Pairs of places that may touch: points of integration on a surface, each with a place of a tool or of another group.
+"""Possible contact pairs: quadrature points on a surface, each with a place on a tool or another group.
 
-How far apart the places of a pair are follows from w = B u.  B has the nodes of the point's cell, and of the other
-side's where that deforms: the place of a tool moves as the tool does.
+The relative displacement of a pair is w = B u.  B has the nodes of the point's cell and, for groups, of the
+other side.  A place on a tool moves with the tool.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mpm_dolfinx.parallel.exchange import Exchange
 
 
 class Geometry(NamedTuple):
-    """The pairs at some w; arrays over m of them.
+    """Geometry of m pairs at some w.
 
-    gap : (m,), m, negative where they penetrate; n : (m, d) its derivative by w, the unit normal out of the other side;
-    curvature : (m, d, d) second derivative, 1/m, None where it is zero; slip : (m, d), m, in the step;
-    arm : (m, d), m, from where moments count.
+    gap (m,): m, negative in penetration; n (m, d): its derivative by w, the outward unit normal of the other side;
+    curvature (m, d, d): second derivative, 1/m, None if zero; slip (m, d): in the step, m; arm (m, d): lever arm of
+    moments, m.
     """
 
     gap: NDArray[np.float64]
@@ -44,11 +44,11 @@ class Geometry(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs in owned cells; arrays over m of them.
+    """m pairs in owned cells.
 
-    number, cell : (m,) contact, local cell; area : (m,), m^(d-1); resistance : (m,), Pa, see `conditions`, the lower
-    one of both sides; pressure, shear : (m,) and (m, d), Pa, on the points before the step; x : (m, d), m, where the
-    grid sees the points; sign : (contacts,) with which forces on the points count.
+    number, cell (m,): contact, local cell; area (m,): m^(d-1); resistance (m,): lower one of both sides, Pa, see
+    `conditions`; pressure, shear (m,), (m, d): of the points before the step, Pa; x (m, d): positions of the points in
+    the grid, m; sign (contacts,): sign of the forces on the points in the results.
     """
 
     grid: Grid
@@ -62,19 +62,19 @@ class Pairs:
     sign: NDArray[np.float64]
 
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
-        """Return the pairs at w (m, d), m, where loads have pushed tools (contacts,), m, in the step.
+        """Return the geometry at w (m, d), m, for displacements of tools by loads (contacts,), m, in the step.
 
-        travel: (contacts, d), m, where tools are free.
+        travel: (contacts, d), m, with free tools.
         """
         raise NotImplementedError
 
     @property
     def reach(self) -> NDArray[np.float64] | float:
-        """Largest coordinate of what gaps are measured from, m; of the pairs (m,), or of all."""
+        """Largest coordinate in the calculation of gaps, m; for each pair (m,), or for all."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the lexicographic cells (m,), and shape functions (m, 2^d), of other sides that deform."""
+        """Return the lexicographic cells (m,) and shape functions (m, 2^d) of deformable other sides, else None."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -87,11 +87,11 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class ToolPairs(Pairs):
-    """Points on faces that look at tools.
+    """Points on faces that face tools.
 
-    tools, poses : (contacts,) the tools, and where they are at the end of the substep, as far as loads had pushed them
-    at the start of the step; now, carried : (m, d), m, place of the point at the start of the step, and where the tool
-    takes what touches it there; shears have turned with the tool.
+    tools, poses (contacts,): tools, and their poses, with displacements by loads up to the start of the step; now,
+    carried (m, d): position of the point at the start of the step, and its image under the motion of the tool, m.
+    Shears are rotated with the tool.
     """
 
     tools: Sequence[Tool]
@@ -126,18 +126,18 @@ class ToolPairs(Pairs):
 
     @property
     def reach(self) -> NDArray[np.float64]:
-        """See `Pairs`: of functions of the user's, which are asked at true places, it is that of these."""
+        """See `Pairs`: user functions are evaluated at true positions, so these determine the rounding error."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
 
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Points on the surface of one group, and the places on the faces of another that they meet along their normals.
+    """Points on the surface of one group, and opposite places along their normals on the faces of another.
 
-    other : (m,) lexicographic cell of the other side; y : (m, d), m, where the grid sees it; n : (m, d) normal out of
-    it; apart : (m, d), m, from it to the point, without the displacement of the step; place : (m,) number of the point,
-    the same for all pairs that it has in a step.
+    other (m,): lexicographic cell of the other side; y (m, d): position of the place in the grid, m; n (m, d): its
+    outward normal; apart (m, d): from the place to the point, without the displacement of the step, m; place (m,):
+    number of the point, equal for all its pairs in a step.
     """
 
     other: NDArray[np.int64]
@@ -147,7 +147,7 @@ class FacePairs(Pairs):
     place: NDArray[np.int64]
 
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`; moments count with the places of the start of the step."""
+        """See `Pairs`; moments refer to the positions at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.apart + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base)
 
@@ -168,7 +168,7 @@ def at_nodes(
 ) -> PETSc.Mat:
     """Return the matrix with values (m, 2^d) at the nodes of cells, component by component.
 
-    other: lexicographic cells of any process; values (m, 2 * 2^d) are then at the nodes of these as well.
+    other: lexicographic cells of any process; values (m, 2 * 2^d) then include their nodes.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)
@@ -186,8 +186,8 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return a matrix of rows of this process, with so many columns of it; own: that have no entries in others."""
-    rows.sort_indices()  # as PETSc wants them
+    """Return a matrix from rows of this process, with `columns` local columns; own: all entries are in these."""
+    rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
     A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)
@@ -196,7 +196,7 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
-    """Refuse a function of the user's that is no distance near the tool."""
+    """Raise an error for a user function that is not a signed distance near the tool."""
     size = np.linalg.norm(n, axis=1)
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""The contact of a substep: with tools, or of groups of bodies with one another.
+"""Contact problem of a substep, with tools or between groups of bodies.
 
-With w = B u, how the places of pairs move apart in the step, forces on the nodes are B^T f(w): those on both bodies are
-equal and opposite to rounding, whatever the iterations leave.  Where both sides deform, pairs, normals and gaps are at
-first those of the start of the step.  What balances with them is balanced anew with those of where it has come to,
-until gaps are those of the faces at the end of the step.
+With the relative displacements w = B u of the pairs, nodal forces are B^T f(w).  Forces on both bodies are therefore
+equal and opposite within rounding.  For two deformable sides, pairs, normals and gaps are at first taken from the
+start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This ends
+when the gaps match the faces at the end of the step.
 
-The way a of a tool that a load pushes is one more unknown, in the direction e: with the forces f(w - a e) on points,
-D minus their derivative by w, and s = e . D e, Newton's method solves e . f = load together with the balance of the
-bodies, by
+The displacement a of a load-controlled tool along its direction e is one more unknown.  Let f(w - a e) be the forces on
+points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with the
+equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s,
 
@@ -39,13 +39,13 @@ from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-FOLLOWS = 8  # how often pairs are found at most in a step
+FOLLOWS = 8  # largest number of pair updates in a step
 
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """What pushes k tools: names that errors call them; start (k,), m, how far before the step; direction
-    (k, d), unit vectors; load (k,), N, nan where there is none.
+    """Loads of k tools: names for errors; start (k,): displacement by the load before the step, m; direction (k, d):
+    unit vectors; load (k,): N, nan without.
     """
 
     names: Sequence[str]
@@ -56,11 +56,11 @@ class Pushes:
 
 @dataclass(frozen=True, eq=False)
 class Ways:
-    """How far loads push k tools in the step: way (k,), m, at w (m, d), m, and elsewhere
+    """Linearised displacements of k load-controlled tools in the step: way (k,), m, at w (m, d), m, and elsewhere
 
         way + shift + sum slope . (w' - w),
 
-    the sum over the pairs (m,) of each tool: this is how Newton's method goes on from there.
+    with the sum over the pairs (m,) of each tool; Newton's method follows this line.
     """
 
     w: NDArray[np.float64]
@@ -70,9 +70,9 @@ class Ways:
 
 
 class Found(NamedTuple):
-    """The contact at some displacement: where pairs are, what acts on them, how far loads push tools (k,), m.
+    """Contact at some displacement: geometry, forces, and displacements of tools by loads (k,), m.
 
-    balanced (m, d), N: forces on the points, with what those change by as tools go on to where they meet their loads.
+    balanced (m, d): forces on the points, N, after the tools' Newton increment towards equilibrium with their loads.
     """
 
     at: Geometry
@@ -82,7 +82,7 @@ class Found(NamedTuple):
 
 
 class Current(NamedTuple):
-    """The conditions of the pairs as they are found at present, where these come from, and the state of iterations."""
+    """Contact law of the present pairs, their origin, and the state of the iterations."""
 
     law: ContactLaw
     origin: Origin
@@ -91,7 +91,7 @@ class Current(NamedTuple):
 
 
 class Gone(NamedTuple):
-    """How tools have gone in a substep with the share own, s: their poses, and the flight of free ones."""
+    """Motion of tools in a substep with time weight own, s: their poses, and the flight of free tools."""
 
     own: float
     poses: Any
@@ -99,18 +99,18 @@ class Gone(NamedTuple):
 
 
 class ContactProblem(Loads):
-    """The contact; `now` is replaced as it is solved.
+    """Contact as a load; `now` is replaced during the solution.
 
     Parameters
     ----------
     law, origin
-        The conditions at the start of the step, and where their pairs come from.
+        Contact law at the start of the step, and origin of its pairs.
     pushes
-        What pushes tools.
+        Loads of tools.
     again
-        Returns the law and origin of the pairs that points meet at displacements, a local array, m, see `FacePairs`.
+        Function that returns law and origin of the pairs at displacements, a local array, m, see `FacePairs`.
     reach
-        Returns all pairs of lexicographic cells that pairs of this process may be in, first * cells + second.
+        Function that returns all pairs of lexicographic cells of this process's pairs, first * cells + second.
     """
 
     linear, smooth, touches = False, False, True
@@ -135,7 +135,7 @@ class ContactProblem(Loads):
 
     @property
     def pairs(self) -> Pairs:
-        """The pairs at present."""
+        """The present pairs."""
         return self.now.law.pairs
 
     @property
@@ -145,7 +145,7 @@ class ContactProblem(Loads):
 
     @property
     def couples(self) -> bool:
-        """Whether nodes of different cells act on one another through the contact."""
+        """Whether the contact couples nodes of different cells."""
         return self.pushed or self._reach is not None
 
     def found(self, at: At) -> Found:
@@ -160,7 +160,7 @@ class ContactProblem(Loads):
         return w.array_r.reshape(-1, self.grid.dim).copy()
 
     def _B(self, law: ContactLaw, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
-        """Return B of the pairs of a law, and room for its product."""
+        """Return B of the pairs of a law, and a vector for its product."""
 
         def make() -> tuple[PETSc.Mat, PETSc.Vec]:
             B = law.pairs.operator(unknowns)
@@ -184,14 +184,14 @@ class ContactProblem(Loads):
         return found._replace(balanced=touch.force + more)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Take the forces at u off."""
+        """Subtract the forces at u."""
         B, w = self._B(self.now.law, at.unknowns)
         w.array_w[:] = -self.found(at).balanced.ravel()
         B = B if on is at.unknowns else self.pairs.operator(on)
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return zeros wherever a `coupling` may have entries in the step that cells have not; None if nowhere."""
+        """Return a zero matrix with the pattern of `coupling` in the step, beyond that of cells; None if none."""
         out = self._pattern_of_pairs(unknowns) if self._reach is not None else None
         for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
@@ -202,7 +202,7 @@ class ContactProblem(Loads):
         return out
 
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return something wherever pairs that follow the bodies may couple nodes."""
+        """Return a matrix with the pattern of pairs that follow the bodies."""
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._reach(), len(grid.owners))
         travel = Exchange(grid.comm, grid.owner(cell))
@@ -243,7 +243,7 @@ class ContactProblem(Loads):
         return out
 
     def _way(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (tools,), m, loads push tools at w (m, d), m: along the line of the last Newton step."""
+        """Return the displacements (tools,), m, by loads at w (m, d), m, along the last Newton step."""
         ways, h = self.now.ways, self.grid.least
         if not over_all(self.grid.comm, int((w != ways.w).any())):
             return ways.way
@@ -251,7 +251,7 @@ class ContactProblem(Loads):
         return np.clip(ways.way + ways.shift + more, -h, h)
 
     def _linearised(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Ways:
-        """Return the ways of tools, and how they go on where the bodies do."""
+        """Return the linearised displacements of tools."""
         law, of = self.now.law, self.pairs.number
         at, touch, *_ = found = self._find_at(w, way)
         _, slope, _ = self._met(found)
@@ -260,7 +260,7 @@ class ContactProblem(Loads):
         return Ways(w, way, shift, by[of, None] * law.slope(touch, at, self.pushes.direction[of], adjoint=True))
 
     def _met(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return what tools meet along their loads (tools,), N, its derivative, N/m, and how well it can be met, N."""
+        """Return the reactions along the loads (tools,), N, their derivatives, N/m, and their rounding errors, N."""
         law, e = self.now.law, self.pushes.direction[self.pairs.number]
         slope = law.slope(found.touch, found.at, e)
         met, slope = law.by_contact(np.stack([(e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)], axis=1)).T
@@ -268,9 +268,9 @@ class ContactProblem(Loads):
         return met, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return how far tools go (tools,), m, until a place alone would bear the load, and which tools touch.
+        """Return the displacements (tools,), m, at which a single place would bear the load, and which tools touch.
 
-        Infinity where there is no such place.
+        Infinity if there is no such place.
         """
         law = self.now.law
         state = self.now.state
@@ -285,15 +285,15 @@ class ContactProblem(Loads):
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
 
     def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return how far tools go on (tools,), m, to meet their loads by their slope."""
+        """Return the Newton increments (tools,), m, of tools towards equilibrium with their loads."""
         met, slope, _ = self._met(found)
         off = np.nan_to_num(self.pushes.load - met)
         far, touches = self._seek(found)
-        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # what slips resists no more
+        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # pure slip does not stiffen
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return how far tools go (tools,), m, before the bodies do: at most to where one place would bear the load."""
+        """Return initial displacements (tools,), m, for fixed bodies, at most until a single place bears the load."""
         way = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -305,7 +305,7 @@ class ContactProblem(Loads):
         return way
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
+        """Update the slipping set at u and, if sticks, returns to stick; return whether the set changed."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
         way = self.found(at).travel
         if self.now.law.grips:
@@ -315,10 +315,10 @@ class ContactProblem(Loads):
             self.now = self.now._replace(ways=self._linearised(w, way))
         return changed
 
-    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
-        """Augment the pressures where means penetrate too deep at u; return whether they do.
+    def augment(self, at: At) -> bool:
+        """Augment the pressures if mean penetrations at u are too large; return whether forces changed.
 
-        Where they do not, tools that do not meet their loads go on to where they may.
+        Otherwise move tools whose reaction differs from their load.
         """
         found = self.found(at)
         law = self.now.law
@@ -336,16 +336,16 @@ class ContactProblem(Loads):
         _, touches = self._seek(found)
         lost = wrong & ((found.travel >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(lost)[:1]:
-            why = f"meets {met[k]:.6g} N, however far it goes: do the bodies hold it?"
+            why = f"the reaction is {met[k]:.6g} N for any displacement: do the bodies constrain it?"
             if met[k] == 0:
-                why = "meets nothing within a cell: does it begin where it touches the bodies?"
-            raise NotConverged(f"{self.pushes.names[k]}: is pushed by {load[k]:.6g} N and {why}")
+                why = "there is no contact within a cell: does it begin at the surface of a body?"
+            raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
         ways = self.now.ways
         self.now = self.now._replace(ways=self._linearised(ways.w, np.clip(ways.way + ways.shift * wrong, -h, h)))
         return True
 
     def follow(self, at: At) -> bool:
-        """Find pairs anew at u, a local array, m; return whether these change the balance."""
+        """Update the pairs at u, a local array, m; return whether this changes the equilibrium."""
         if self._again is None or self.now.state.follows == FOLLOWS:
             return False
         new = Current(*self._again(at.u), self.now.state)
@@ -356,9 +356,9 @@ class ContactProblem(Loads):
         return True
 
     def _continued(self, new: Current, at: At) -> tuple[Current, float]:
-        """Return the contact with pairs that were found at u, and by how much gaps differ from the present, cells.
+        """Return the contact with pairs found at u, and the largest difference of gaps from the present ones, cells.
 
-        What touches in neither does not count.
+        Pairs that are open in both are ignored.
         """
         found = self.found(at)
         law = self.now.law
@@ -382,15 +382,15 @@ class ContactProblem(Loads):
         return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with the pressures and shear tractions that contacts have on them at u."""
+        """Return the points with the contact pressures and shear tractions at u."""
         law, origin, *_ = self.now
         contacts = dict(zip(law.names, law.contacts, strict=True))
         return origin.means(contacts, points, *law.tractions(self.found(at).touch))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`: only tools bring work; what sticks takes what bends its elastic hold, and gives it back.
+        """See `Loads`: only tools do work; elastic slip in stick is counted as dissipation, and returned on unloading.
 
-        Pressures do none at the gap: where one closes within a step the velocities of substeps jump.
+        Pressures count as doing no work, because velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)
@@ -399,16 +399,16 @@ class ContactProblem(Loads):
         moves = apart.array_r.reshape(-1, self.grid.dim)
         tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
         shear = law.pairs.area[:, None] * found.touch.shear[law.of]
-        # the part of the nodes' power that `push` has counted is that of the tools
+        # `push` has counted the power of the tools as a part of the nodes' power
         more = -float((found.balanced * moves).sum()) + float((found.touch.force * tool).sum())
         return -float((shear * (moves - tool)).sum()), more
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """Return the velocities (m, d), m/s, of the places of tools; nothing where both sides deform."""
+        """Return the velocities (m, d), m/s, of places on tools; zero for two deformable sides."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and how far loads push tools, m."""
+        """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and displacements by loads, m."""
         where, touch, travel, _ = self.found(at)
         names = self.now.law.names
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
@@ -417,10 +417,7 @@ class ContactProblem(Loads):
         return out
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:
-        """Return cells (m,), lexicographic ones of other sides that deform, places and directions (m, d) of what holds.
-
-        That is what touches at the start of the step.
-        """
+        """Return cells (m,), cells of deformable other sides, positions and directions (m, d) of initial contact."""
         at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
         law = self.now.law
         d = self.grid.dim
@@ -432,7 +429,7 @@ class ContactProblem(Loads):
         return self.pairs.cell[rows], None if other is None else other[0][rows], self.pairs.x[rows], along
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what rounding leaves: that of gaps as well, which goes with coordinates."""
+        """Return the rounding errors, which include gaps between large coordinates."""
         if self.pairs.other_side() is not None:
             return of_cells
         out, cells = of_cells.copy(), self.pairs.cell
@@ -441,14 +438,14 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """What rounding leaves on other sides, in other cells."""
+        """Rounding error of forces in cells of other sides, N."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
-    """Return a b^T, of what is not zero."""
+    """Return a b^T without zero rows and columns."""
     start, comm = b.owner_range[0], b.comm.tompi4py()
     rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
     at, value = start + columns, b.array_r[columns]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Shapes of rigid tools: signed distances, m, positive outside, in the place that a tool has before its motion."""
+"""Shapes of rigid tools: signed distances, m, positive outside, in the initial position of the tool."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from scipy.spatial import ConvexHull, QhullError
 from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-ROUNDED = 1e-9  # cells: what is no deeper in a tool is on its surface
+ROUNDED = 1e-9  # cells: penetration that counts as on the surface
 DISTANCE = 0.1
-"""Relative error of the slope of a user's distance from which on it is none."""
+"""Relative error of the slope above which a user function is no distance."""
 
 
 class Shape(Protocol):
-    """A solid; places y (m, d) are in the frame of the tool."""
+    """A solid; positions y (m, d) are in the frame of the tool."""
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m."""
@@ -38,31 +38,31 @@ def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return lengths (m,) of vectors (m, d), their directions, and the second derivatives of the lengths, 1/m."""
+    """Return lengths (m,), m, and directions of vectors (m, d), m, and second derivatives of the lengths, 1/m."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
 
 
 def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return a unit vector (d,); ValueError where there is none."""
+    """Return a unit vector (d,); ValueError for an invalid or zero vector."""
     v = numbers(name, value, (2,), (3,), allowed="a vector of 2 or 3 finite components, not zero")
     if not v.any():
         raise ValueError(f"{name} = {line(value)}, must be a vector of 2 or 3 finite components, not zero")
-    v = v / np.abs(v).max()  # squares of huge and tiny ones are not finite, or zero
+    v = v / np.abs(v).max()  # avoids overflow and underflow of squares
     return v / np.linalg.norm(v)
 
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """All that lies behind a plane: a plate, a wall, the ground.
+    """The half-space behind a plane: a plate, a wall, the ground.
 
     Parameters
     ----------
     point : (d,), m
-        A place on the plane.
+        A position on the plane.
     outward : (d,)
-        Normal of the plane that points out of the tool, towards the bodies; of any length.
+        Normal of the plane, out of the tool towards the bodies; of any length.
     """
 
     point: ArrayLike
@@ -93,13 +93,13 @@ class HalfSpace:
         return _flat(y)
 
     def moved(self, by: NDArray[np.float64]) -> HalfSpace:
-        """Return the shape moved by a vector (d,), m."""
+        """Return the shape, moved by a vector (d,), m."""
         return replace(self, point=np.asarray(self.point) + by)
 
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """A sphere; in 2D a disc, that is a cylinder.
+    """A sphere; in 2D a disc, the section of a cylinder.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class Ball:
         return _across(y - self.centre)[2]
 
     def moved(self, by: NDArray[np.float64]) -> Ball:
-        """Return the shape moved by a vector (d,), m."""
+        """Return the shape, moved by a vector (d,), m."""
         return replace(self, centre=np.asarray(self.centre) + by)
 
 
@@ -142,13 +142,13 @@ class Ball:
 class Convex:
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
-    Its distance is that of the nearest of its planes: inside exact; outside, beside edges and corners, where nothing
-    touches, too small.
+    The distance is the largest one to its planes.  It is exact inside; outside, next to edges and corners, it is
+    too small, but there is no contact there.
 
     Parameters
     ----------
     corners : (m, d), m
-        At least d + 1 that do not lie in one line or plane.
+        At least d + 1 corners, not in one line or plane.
     """
 
     corners: ArrayLike
@@ -182,7 +182,7 @@ class Convex:
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance: where planes are as near, the mean of their normals."""
+        """Return the gradients (m, d) of the distance; the mean normal of equally near planes."""
         each = self._each(y)
         near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
         return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
@@ -192,13 +192,13 @@ class Convex:
         return _flat(y)
 
     def moved(self, by: NDArray[np.float64]) -> Convex:
-        """Return the shape moved by a vector (d,), m."""
+        """Return the shape, moved by a vector (d,), m."""
         return replace(self, corners=np.asarray(self.corners) + by)
 
 
 @dataclass(frozen=True, eq=False)
 class Cone:
-    """A cone without end; in 2D a wedge.
+    """An infinite cone; in 2D a wedge.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ class Cone:
     axis : (d,)
         Direction from the tip into the tool; of any length.
     angle_deg
-        Between axis and flank, degrees, in (0, 90): 30 of a CPT's cone.
+        Angle between axis and flank, degrees, in (0, 90); 30 for a CPT cone.
     """
 
     tip: ArrayLike
@@ -228,7 +228,7 @@ class Cone:
         return len(self._axis)
 
     def _polar(self, y: NDArray[np.float64]) -> tuple:
-        """Return heights (m,) over the tip, and what `_across` gives of the offsets from the axis."""
+        """Return heights (m,) above the tip, and `_across` of the offsets from the axis."""
         z = (y - self.tip) @ self._axis
         return z, *_across(y - self.tip - z[:, None] * self._axis)
 
@@ -253,16 +253,16 @@ class Cone:
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
 
     def moved(self, by: NDArray[np.float64]) -> Cone:
-        """Return the shape moved by a vector (d,), m."""
+        """Return the shape, moved by a vector (d,), m."""
         return replace(self, tip=np.asarray(self.tip) + by)
 
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape whose signed distance a function of the user's gives; its derivatives are differences.
+    """A shape by a user's signed distance function, with derivatives by finite differences.
 
-    size : m, of a cell, of which steps are shares.  base : (d,), m — from which places count; of true places the
-    function is asked.  Steps are powers of two, by which no true place is rounded to another one.
+    size: cell size, m, the scale of increments; base (d,): origin of positions, m, because the function is evaluated at
+    true positions.  Increments are powers of two, so that they do not round true positions together.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]
@@ -274,8 +274,8 @@ class Distance:
         return self._at(y + self.base)
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, at true places."""
-        if not len(y):  # a function need not have an answer for no places
+        """Return the signed distances (m,), m, at true positions."""
+        if not len(y):  # user functions may fail for no positions
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
         value = asked("Tool: shape", allowed, self.function, y)
@@ -286,7 +286,7 @@ class Distance:
         return self._slopes(y + self.base, _power_of_two(CENTRAL * self.size))
 
     def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-        """Return differences (m, d) of the distance over a step, m, at true places."""
+        """Return central differences (m, d) of the distance, with an increment of `step`, m, at true positions."""
         slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 
@@ -299,5 +299,5 @@ class Distance:
 
 
 def _power_of_two(x: float) -> float:
-    """Return the power of two next to a number."""
+    """Return the power of two nearest to a number."""
     return float(2.0 ** np.rint(np.log2(x)))

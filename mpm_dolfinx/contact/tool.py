@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid tools that press on the bodies, and how they move."""
+"""Rigid tools in contact with the bodies, and their motion."""
 
 from __future__ import annotations
 
@@ -15,68 +15,68 @@ from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Cone, Convex, Distance, HalfSpace, Shape, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 
-ONTO = 100  # times at most that a place is put onto the surface
+ONTO = 100  # largest number of projections onto the surface
 
 
 class Pose(NamedTuple):
-    """Where a tool is: R (d, d) turns it about `centre` (d,), m, and `shift` (d,), m, moves it."""
+    """Pose of a tool: rotation R (d, d) about `centre` (d,), m, then translation by `shift` (d,), m."""
 
     R: NDArray[np.float64]
     centre: NDArray[np.float64]
     shift: NDArray[np.float64]
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return places x (m, d) in the frame of the tool."""
+        """Return positions x (m, d) in the frame of the tool."""
         y = x - self.shift
-        return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # what does not turn loses no digits
+        return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where places y (m, d) of the tool are."""
+        """Return the present positions of places y (m, d) in the frame of the tool."""
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """A rigid tool that presses on the surface of the bodies, wherever it meets it.
+    """Rigid body in contact with the surface of the bodies, anywhere on it.
 
-    Nothing passes into it; what leaves it is free.  Where it touches, sides keep their hydraulic condition.  The forces
-    and moments by which it acts on the bodies are the simulation's `tool_forces`.
+    Bodies do not penetrate it, and may separate from it.  Sides in contact keep their hydraulic condition.  The
+    simulation's `tool_forces` are its forces and moments on the bodies.
 
     Parameters
     ----------
     shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
-        The solid, as it is before its motion; a function gives the signed distance, positive outside of the tool.
+        The solid in its initial position; a function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Of the tool from there; not since a stage.  In axisymmetry along the axis, without a rotation.
+        Displacement from the initial position, also in later stages.  In axisymmetry along the axis, without rotation.
     rotation_rad : float or callable t (s) -> float, rad
-        In 2D: turn about `centre`, anti-clockwise, before the displacement.
+        In 2D: counterclockwise rotation about `centre`, before the displacement.
     centre : (d,), m
-        About which it turns, and moments count; by default the origin.  It moves with the tool.
+        Centre of rotation and reference of moments; by default the origin.  It moves with the tool.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Shear stress that the contact takes besides, Pa, >= 0: alpha s_u of undrained soil, with friction 0.  All of it
-        where the normal pressure is a tenth of it or more, and as much less as that is less.
+        Additional shear strength of the contact, Pa, >= 0: alpha s_u for undrained soil, with friction 0.  It is
+        limited to ten times the normal pressure.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
-        Pushes the tool along `direction`, beyond its displacement, as far as the bodies resist with as much, from the
-        first step on; it begins where it touches them, or less than a cell before.  How far that is, is in the
-        simulation's `tool_travel`.  In axisymmetry the load all around.
+        The tool moves along `direction`, beyond its displacement, until the reaction equals the load, from the first
+        step on.  The tool must begin in contact, or less than a cell away.  `tool_travel` of
+        the simulation is this additional displacement.  In axisymmetry the load of the whole revolution.
     direction : (d,)
-        In which a load pushes; of any length; in axisymmetry along the axis.
+        Direction of the load; of any length; in axisymmetry along the axis.
     mass
-        Of a free tool, kg (kg/m in plane strain), > 0, beside bodies with inertia: its weight, its load and what it
-        touches move it from `displacement`, along `direction` if there is one, else in any; it does not turn.  How far
-        is in `tool_travel` (d,), m, its velocity in `outcome("tool_velocity")` (d,), m/s.
+        Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
+        move it from `displacement`, along `direction` if given, else in any direction.  It does not rotate.  Results
+        are `tool_travel` (d,), m, and the velocity `outcome("tool_velocity")` (d,), m/s.
     velocity : (d,), m/s
-        Of a free tool, as it begins.
+        Initial velocity of a free tool.
     name
-        By which its results are found, and what it has on points, as NAME_pressure; without, "tool".
-        A tool of a later stage that is given the same name keeps that.
+        Name of its results, and of its pressure on points, NAME_pressure; by default "tool".  A tool of the same name
+        in a later stage keeps this pressure.
 
     Raises
     ------
     ValueError
-        What is none that is allowed; from a step: the tool begins inside of a body, or meets a given displacement.
+        An invalid value.  From a step: the tool begins inside a body, or meets a side with prescribed displacement.
     """
 
     shape: Shape | Callable[[NDArray[np.float64]], ArrayLike]
@@ -100,19 +100,19 @@ class Tool:
             value = getattr(self, name)
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
         if (self.load is None) != (self.direction is None) and (self.load is not None or self.mass is None):
-            raise ValueError(f"{line(self)}: load and direction, must be given both, or none")
+            raise ValueError(f"{line(self)}: load and direction, must be given together")
         self._check_free()
         for name in ("displacement", "rotation_rad", "load"):
             value = getattr(self, name)
             if callable(value):
                 check_names(f"{line(self)}: {name}", value, ("t",))
             elif isinstance(value, (list, np.ndarray)):
-                object.__setattr__(self, name, deepcopy(value))  # nobody changes it
+                object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)
 
     def _check_free(self) -> None:
-        """Refuse a mass that is none, and what only free tools have, or have not."""
+        """Raise an error for an invalid mass, and for arguments that depend on it."""
         if self.mass is None:
             if self.velocity is not None:
                 raise ValueError(f"{line(self)}: velocity, must be given with a mass")
@@ -129,7 +129,7 @@ class Tool:
         return self.mass is not None
 
     def begins(self, dim: int) -> NDArray[np.float64]:
-        """Return the velocity (d,), m/s, with which a free tool begins."""
+        """Return the initial velocity (d,), m/s, of a free tool."""
         if self.velocity is None:
             return np.zeros(dim)
         v = numbers("Tool: velocity", self.velocity, (dim,), allowed=f"{dim} finite numbers")
@@ -138,12 +138,12 @@ class Tool:
         return v
 
     def guide(self, dim: int) -> NDArray[np.float64]:
-        """Return the projection (d, d) on the ways that a free tool may go."""
+        """Return the projection (d, d) on the directions in which a free tool may move."""
         along = self.along(dim)
         return np.eye(dim) if self.direction is None else np.outer(along, along)
 
     def pushes(self, t: float) -> float:
-        """Return the load at time t (s), N; nan where none pushes the tool."""
+        """Return the load at time t (s), N; nan without a load."""
         if self.load is None:
             return np.nan
         value = float(self._given("load", t))
@@ -152,11 +152,11 @@ class Tool:
         return value
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
-        """Return one of its values at time t (s): a number, or with a dimension also (d,)."""
+        """Return an attribute's value at time t (s): a number, or with a dimension also (d,)."""
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the unit vector (d,) in which a load pushes, zero without."""
+        """Return the unit vector (d,) of the load, zero without."""
         if self.direction is None:
             return np.zeros(dim)
         along = unit_vector("Tool: direction", self.direction)
@@ -165,7 +165,7 @@ class Tool:
         return along
 
     def on(self, grid: Grid) -> Tool:
-        """Return the tool as places see it that count from the grid's base."""
+        """Return the tool for positions relative to the grid's base."""
         out, base = copy(self), grid.base
         if base.any():
             vars(out).update(_base=base, _moved=None if callable(self.shape) else self.shape.moved(-base))
@@ -177,17 +177,17 @@ class Tool:
         return self.friction > 0 or self.adhesion > 0
 
     def solid(self, h: float) -> Shape:
-        """Return the shape; h, m: size of a cell."""
+        """Return the shape; h: cell size, m."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
-        """Refuse a tool of another dimension, or whose motion at the start is none."""
+        """Raise an error for a tool of another dimension, or with an invalid initial motion."""
         of = dim if callable(self.shape) else self.shape.dim
         if of != dim:
             raise ValueError(f"{line(self)}: a shape in {of}D, must be in {dim}D as the grid")
         if dim == 3 and (callable(self.rotation_rad) or self.rotation_rad):
             raise ValueError(f"{line(self)}: rotation_rad, must be 0 in 3D")
-        for name in ("displacement", "rotation_rad"):  # what a function gives is checked when it is called
+        for name in ("displacement", "rotation_rad"):  # values of functions are checked at their evaluation
             if not callable(getattr(self, name)):
                 self._given(name, 0.0, dim if name == "displacement" else 0)
         self._centre(dim)
@@ -200,7 +200,7 @@ class Tool:
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, way: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return where the tool is at time t (s), after forces have pushed it by a way, m, a vector of a free tool."""
+        """Return the pose at time t (s) after an additional displacement by forces, m, a vector for a free tool."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
@@ -211,10 +211,10 @@ class Tool:
         return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + gone)
 
     def drawn(self, grid: Grid, t: float, way: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return the corners (m, 2^d, d), m, of the grid's cells that the tool fills at time t (s): for pictures.
+        """Return the corners (m, 2^d, d), m, of the grid's cells inside the tool at time t (s), for pictures.
 
-        way, m: by which forces have pushed it, see `pose`.
-        Corners beyond its surface are put onto it; so its edges are blunt by a part of a cell.
+        way: displacement by forces, m, see `pose`.  Corners beyond the surface are projected onto it, so edges are
+        blunt by a fraction of a cell.
         """
         pose = self.pose(t, grid.dim, way)
         solid = self.solid(grid.least)
@@ -224,7 +224,7 @@ class Tool:
         cells = grid.corners(np.arange(np.prod(grid.shape)))
         used, at = np.unique(cells[inside[cells].any(axis=1)], return_inverse=True)
         y = y[used]
-        for _ in range(ONTO):  # where planes meet
+        for _ in range(ONTO):  # several times, for edges between planes
             gap = solid.distance(y)
             if (gap <= ROUNDED * grid.least).all():
                 break

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The rigid tools of a stage: where they touch the bodies in a step, and what points keep of them.
+"""Tools of a stage: their contact with the bodies in a step, and the contact history of points.
 
-The contact itself is in `problem`.
+The contact equations are in `problem`.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
-NEAR = 0.1  # cells: corners that are nearer go with the tool
-STRIDE = 0.02  # cells: tools that are thinner may pass points within a step unseen
-LEFT = 1e-3  # cells: how deep corners stay in tools; put onto what is less deep they would roughen the stress
-FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
+BEGINS = 1e-2  # cells: allowed initial penetration into a body, and penetration of prescribed sides
+NEAR = 0.1  # cells: corners within this distance follow the Q1 field
+STRIDE = 0.02  # cells: points may pass thinner tools in a step undetected
+LEFT = 1e-3  # cells: penetration left to corners, as a full projection would roughen the stress
+FACING = 0.5  # cosine between a face's normal and the direction to the tool above which it faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return the corners (d,) of the box around places (m, d), and how those of processes are put together."""
+    """Return the corners (d,) of the bounding box of positions (m, d), and the reductions over processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
 class Ways(NamedTuple):
-    """How far loads have pushed tools (k,), m, at the start and the end of a step, at two times, s."""
+    """Displacements of tools by loads (k,), m, at the start and the end of a step, with both times, s."""
 
     start: float
     end: float
@@ -55,7 +55,7 @@ class Ways(NamedTuple):
     after: NDArray[np.float64]
 
     def at(self, t: float) -> NDArray[np.float64]:
-        """Return how far they have at a time of the step (s)."""
+        """Return the displacements at a time in the step (s)."""
         share = (t - self.start) / (self.end - self.start) if self.end > self.start else 1.0
         return self.before + share * (self.after - self.before)
 
@@ -68,11 +68,11 @@ class Tools:
     grid, materials
         Background grid, and the materials of the scene.
     tools
-        The tools by name.
+        Tools by name.
     outside
-        The surface of the bodies.
+        Surface of the bodies.
     held
-        Given displacements with their faces, on which tools do not act.
+        Prescribed displacements with their faces, which tools do not touch.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Tools:
         still = np.zeros(len(self.tools))
         self._ways, self._end = Ways(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
-            raise ValueError("tools: one is given twice, must be tools of their own")
+            raise ValueError("tools: one is given twice, must be distinct")
         for tool in self.tools:
             tool.check(grid.dim)
             if grid.axisymmetric and tool.along(grid.dim)[0]:
@@ -112,17 +112,17 @@ class Tools:
 
     @property
     def free(self) -> bool:
-        """Whether forces move any of them."""
+        """Whether any tool is free."""
         return any(tool.free for tool in self.tools)
 
     @property
     def masses(self) -> NDArray[np.float64]:
-        """Masses (tools,), kg, 0 of those that are not free."""
+        """Masses (tools,), kg, 0 for tools that are not free."""
         return np.array([tool.mass or 0.0 for tool in self.tools])
 
     @property
     def guides(self) -> NDArray[np.float64]:
-        """Projections (tools, d, d) on the ways that free tools may go, in axisymmetry along the axis."""
+        """Projections (tools, d, d) on the directions of free tools, in axisymmetry along the axis."""
         d = self.grid.dim
         out = np.array([tool.guide(d) * tool.free for tool in self.tools])
         return out * (np.arange(d) > 0)[:, None] if self.grid.axisymmetric else out
@@ -133,17 +133,17 @@ class Tools:
         return np.array([np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools])
 
     def going(self, ways: Ways, end: float | None = None) -> Tools:
-        """Return the tools as loads push them in a step; end: of the step of bodies with inertia, s."""
+        """Return the tools with their displacements by loads in a step; end: of a step with inertia, s."""
         tools = copy(self)
         tools._ways, tools._end = ways, end
         return tools
 
     def pose(self, number: int, t: float) -> Pose:
-        """Return where a tool is at time t (s)."""
+        """Return the pose of a tool at time t (s)."""
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return where a tool is in a substep that ends at time t (s), with inertia where it has its velocity.
+        """Return the pose of a tool at the end of a substep, t (s), which with inertia gives its velocity.
 
         See `in_step`.
         """
@@ -161,7 +161,7 @@ class Tools:
         return pose._replace(shift=shift, R=turn @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
-        """Return where a tool is at time t (s); in axisymmetry it goes along the axis."""
+        """Return the pose of a tool at time t (s); ValueError for invalid motion in axisymmetry."""
         pose = tool.pose(t, self.grid.dim, self._ways.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
@@ -169,20 +169,20 @@ class Tools:
         return pose
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what n points keep of the tools, zero."""
+        """Return zero contact histories of n points."""
         return kept(dict(zip(self.names, self.tools, strict=True)), n, self.grid.dim)
 
     def placed(
         self, cut: CutDomains, points: MaterialPoints, start: float, t: float
     ) -> tuple[ContactLaw, Origin, Pushes]:
-        """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""
+        """Return the contact at time t (s) of a step that began at `start`, with the present points."""
         grid, d = self.grid, self.grid.dim
         patches = cut.surface(self.faces)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
         resists = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
-        # initial stresses are without them
+        # loads do not act on the initial stress
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
@@ -209,15 +209,15 @@ class Tools:
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which of the places that face a tool lie less than half a cell before its edge, if the body goes on.
+        """Return which places that face a tool lie within half a cell of its edge, where the body continues.
 
-        The last node that a tool presses carries half a cell beyond it: up to there its edge presses nothing.  A tool
-        of which nothing would be left, less than a cell wide, presses all over.
+        The last loaded node carries half a cell beyond it, so there is no contact on this margin.  A tool narrower than
+        a cell keeps its whole contact.
 
         Parameters
         ----------
         x, unit : (m, d), m, -
-            Places on the surface of the bodies, and outward normals.
+            Positions on the surface of the bodies, and outward normals.
         faces : (m,)
             Which of them face the tool.
         """
@@ -233,7 +233,7 @@ class Tools:
             return edge
 
         def cells(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return places in cells."""
+            """Return positions in cells."""
             return x / grid.h if grid.even else grid.in_cells(x)
 
         low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
@@ -249,22 +249,22 @@ class Tools:
         return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
+        """Raise an error for tools inside a body at time t (s), except at faces with contact from earlier steps."""
         patches = cut.surface(self.faces)
         x = patches.now(points)
         for number, tool in enumerate(self.tools):
             met = points.data[pressure_name(self.names[number])] > 0
             deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
             if deep > BEGINS:
-                what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"
+                what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
     def check_end(
         self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
     ) -> None:
-        """Refuse a step after which tools have points in them, or meet what is given, or in which they pass points.
+        """Raise an error if tools contain points, touch prescribed sides, or have passed through points in a step.
 
-        before: the points at the start of the step, at the time `start` (s).
+        before: points at the start of the step, time `start` (s).
         """
         for tool in self.tools:
             for hold, faces in self._held:
@@ -275,16 +275,16 @@ class Tools:
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
             deep, where = self._deepest(tool, points.x, t)
             held, there = self._deepest(tool, middle(corners), t)
-            if deep > NEAR or held > 0:  # stretched domains have their middles in round tools, not their corners
+            if deep > NEAR or held > 0:  # in a round tool, stretched domains have their middles, not their corners
                 where = where if deep > NEAR else there
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
             if where := self._passed(tool, (before.x, points.x), (start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains touch tools at time t (s): these follow the Q1 field alone.
+        """Return which corners (n, 2^d, d) of domains touch tools at time t (s), and follow the Q1 field alone.
 
-        What else they follow would be pushed back by the tool in the next step, and roughen the pressure.
+        The tool would push back any further motion in the next step, which roughens the pressure.
         """
         out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.least
         for tool in self.tools:
@@ -294,9 +294,9 @@ class Tools:
     def outside(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float = NEAR
     ) -> NDArray[np.float64]:
-        """Return corners of domains, with those that are a little in tools put as near their surface as `LEFT`.
+        """Return corners of domains, where small penetrations of tools are reduced to `LEFT`.
 
-        Tools hold the mean of what a cell holds; domains that slide along would leave corners behind in them.
+        Tools constrain means over cells, so corners of sliding domains would remain inside them.
 
         Parameters
         ----------
@@ -305,9 +305,9 @@ class Tools:
         t
             Time, s.
         free : (n, 2^d, d)
-            Which components nothing else gives.
+            Components that no other condition prescribes.
         most
-            What is deeper stays, cells.
+            Largest penetration that is corrected, cells.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
@@ -326,9 +326,9 @@ class Tools:
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return one of the places x (n, d) that go straight through a tool between two times (s), or nothing.
+        """Return one of the positions x (n, d) that pass straight through a tool between two times (s), or "".
 
-        Places go on by their distance to the tool (sphere tracing: Hart 1996).
+        The search advances by the distance to the tool (sphere tracing: Hart 1996).
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
@@ -338,7 +338,7 @@ class Tools:
         along = (end - y) / np.maximum(way, TINY)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
-        turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle in the tool that comes to its other side
+        turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle that leaves the tool on its other side
         if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned + self.grid.base)):
             return where
         on = on[~inside]
@@ -353,7 +353,7 @@ class Tools:
         return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
-        """Return how deep places x (m, d) are in a tool at most, in cells, and where."""
+        """Return the largest penetration of positions x (m, d) into a tool, in cells, and its place."""
         h, pose = self.grid.least, self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)

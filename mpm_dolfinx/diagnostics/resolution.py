@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Warnings that cells or points are too few: cells that are overfilled or shared by layers, bodies too thin to bend."""
+"""Warnings about coarse resolution: overlapping domains, mixed cells of contrasting stiffness, thin bodies."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
+"""Fraction of a cell: volumes of intact domains reach 1.08 when a footing penetrates by half its width."""
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn of the fullest cell, with the bodies in it, if it is overfilled; return what looks for the next."""
+    """Warn about the fullest cell and its bodies if domains overlap in it; return the function for the next check."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
-    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)
-    fill /= grid.volumes(np.arange(grid.num_owned))
+    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
         return warn_overfilled
-    number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
+    number = over_all(grid.comm, int(grid.cell_number[cut.cells[fill.argmax()]]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
     who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
     warn(
         grid.comm,
         ResolutionWarning,
-        "the cell at %s is filled to %.0f %%, more than it holds: %s overlap",
+        "the cell at %s is filled to %.0f %%, more than it can hold: %s overlap",
         x,
         100 * most,
         who,
@@ -50,7 +49,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
 
 
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
-    """Return the bodies in a lexicographic cell, and its midpoint (d,), m; on all processes together."""
+    """Return the bodies in a cell, given by lexicographic number, and its midpoint (d,), m; collective."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
@@ -58,27 +57,27 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOST = 0.03
-"""Share of what a soft material gives, lost in cells that it shares, from which a scene is warned of."""
+"""Lost fraction of a soft material's deformation, in mixed cells, from which a warning is issued."""
 AGAIN = 2.0
-"""Times the share that was named, from which it is named again: interfaces move on to the middle of cells."""
+"""Growth of that fraction from one warning to the next, as interfaces move to the middle of cells."""
 FINE = 0.1
-"""Of what a soft cell gives: what may be lost in a cell; contrasts below 2.1 stay below."""
+"""Fraction of a soft cell's deformation that counts as lost; stiffness contrasts below 2.1 stay below it."""
 
 
 def warn_smeared(
     cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOST
 ) -> Callable[..., Any]:
-    """Warn of the soft material that loses most in cells shared with stiffer ones, if that is much.
+    """Warn about the soft material that loses most deformation in cells shared with stiffer materials.
 
     Parameters
     ----------
     least
-        Share of what the material gives from which it is named, in [0, 1].
+        Lost fraction from which a material is named, in [0, 1].
 
     Returns
     -------
     callable
-        What looks for it the next time.
+        Function for the next check.
     """
     grid = cut.grid
     points = cut.points
@@ -102,22 +101,22 @@ def warn_smeared(
     much = over_all(grid.comm, float(contrast[at].max(initial=0.0)), MPI.MAX)
     those, x = bodies_in(cut, bodies, cell)
     what = "materials of bodies %s share cells, as at %s: material %d, up to %.3g times as soft as its neighbour, "
-    what += "gives about %.0f %% too little under a load across the layers; lay interfaces along grid lines, or take "
+    what += "deforms about %.0f %% too little under a load across the layers; place interfaces on grid lines, or use "
     what += "smaller cells"
     warn(grid.comm, ResolutionWarning, what, " and ".join(map(str, those)), x, i, much, 100 * share)
     return partial(warn_smeared, materials=materials, least=AGAIN * share)
 
 
 def _lost(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return what owned cells lose (n,), m^d of the softest piece in it, their contrasts (n,), and that piece (n,).
+    """Return the lost volumes (n,), m^d, of the softest material in owned cells, contrasts (n,), and its pieces (n,).
 
-    With moduli M and shares s of a cell, layers one upon the other give sum s/M, and with the cell's strain in all of
-    them 1 / sum s M.  The difference, over the 1/M of the softest, is lost: at most (1 - sqrt(r))^2 of the cell with
-    two moduli, r < 1 their ratio.
+    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M; equal strain in the
+    cell gives 1 / sum s M.  Their difference, over the largest 1/M, is lost: at most (1 - sqrt(r))^2 of the cell for
+    two moduli of ratio r < 1.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
-    softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last one stays
+    softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last entry wins
     held, stiffness, compliance = (sum_by(cut.cells, volume * y, n) for y in (1.0, modulus, 1 / modulus))
     lost = np.zeros(n)
     contrast = np.ones(n)
@@ -127,21 +126,20 @@ def _lost(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.floa
     return np.where(lost > FINE * held, lost, 0.0), contrast, softest
 
 
-COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
-FEW = 3  # points over the thickness that bend an eighth too much.  Source: exact, 1 / (n^2 - 1)
-SLENDER = 4  # length over thickness from which a body bends
-LOST_WET = 3.0  # share that wet ones lose, times n^2: beams sealed or open at their end, n = 4 to 32, within a third
-FEW_WET = int((100 * LOST_WET) ** 0.5)  # up to which they lose 1 %.  Source: exact, by LOST_WET
-SLENDER_WET = 2  # length over thickness from which a wet body bends
+COARSE = 0.7  # of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
+FEW = 3  # points over the thickness with an eighth too much bending.  Source: exact, 1 / (n^2 - 1)
+SLENDER = 4  # length over thickness from which a body counts as a beam
+LOST_WET = 3.0  # lost stiffness of wet beams times n^2: sealed or open at their end, n = 4 to 32, within a third
+FEW_WET = int((100 * LOST_WET) ** 0.5)  # points with a loss of 1 %.  Source: exact, by LOST_WET
+SLENDER_WET = 2  # length over thickness from which a wet body counts as a beam
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
-    """Warn for each slender body that is free to bend and has too few points over its thickness.
+    """Warn about each slender body that can bend and has too few points over its thickness.
 
-    A law sees one F in a point's domain: n points over the thickness have 1 - 1/n^2 of the bending stiffness, as
-    n layers of constant stress do, however exactly their domains are integrated.  One point carries no moment at
-    all: what resists is each step's increment only, and the body creeps from step to step.  With pore fluid (wet)
-    more is lost, by measurement, and the body goes on creeping.
+    Stress is constant in a point's domain, so n points over the thickness give 1 - 1/n^2 of the bending stiffness, even
+    with exact integration.  A single point carries no moment.  Only the increment of a step resists, and the body
+    creeps from step to step.  Saturated bodies (wet) lose more, as measured, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -153,13 +151,13 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
                 if n > 1:
                     much = f"it bends {1 / (n**2 - 1):.0%} too much"
                 if n > 1 and wet:
-                    much = f"with pore fluid it bends some {LOST_WET / n**2:.0%} too much and creeps"
+                    much = f"with pore fluid it bends about {LOST_WET / n**2:.0%} too much and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
                 warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, h, much)
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
-    """Return the edge along an axis of the cells that a body lies in, m; of many sizes the mean."""
+    """Return the edge along an axis of the cells under a body, m; the mean for unequal cells."""
     if grid.even:
         return grid.h[axis]
     low, high = body.bounds
@@ -167,7 +165,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Whether a body is slender across an axis, and neither a wall nor another body holds it from that side."""
+    """Return whether a body is slender across an axis, with no wall or other body on either side."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether what lies on the grid is held: parts that can move as rigid bodies make the tangent singular."""
+"""Check that all parts on the grid are constrained: free rigid-body modes make the tangent singular."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ def check_held(
     holds: Sequence[tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]],
     each: bool,
 ) -> None:
-    """Refuse a scene of which a part can move as a rigid body.
+    """Raise an error if a part of the scene can move as a rigid body.
 
     Parameters
     ----------
     active : (cells,)
-        Cells of this process that hold a piece.
+        Cells of this process that contain a cut subdomain.
     free : (nodes, d)
-        Components that no wall holds.
+        Displacement components that no wall fixes.
     holds
-        Cells (m,), lexicographic ones of other parts (m,) or None, positions (m, d) and directions (m, d) in which
-        sides have given displacements, touch tools, or other parts: what is held holds the other one.
+        Constraints by prescribed displacements, tools and contact: cells (m,), lexicographic cells of the other part
+        (m,) or None, positions (m, d), m, and directions (m, d).  A constrained part constrains the other.
     each
-        Look at each part that hangs together, not only at all of them.
+        Check each connected part, not only all parts together.
 
     Raises
     ------
     ValueError
-        Saying where the part is, and in how many ways it can move.
+        With the place of the part and its number of free rigid-body modes.
     """
     part, count = parts_of_cells(grid, active) if each else (active.astype(np.int64), 1)
-    centre, size = _extents(grid, part, count)
     cells = np.flatnonzero(active)
+    centre, size = _extents(grid, cells, part[cells] - 1, count)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
     row, axis = np.nonzero(~free[nodes])
     x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
-    number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
+    number = part[cells[first[row] // 2**grid.dim]]  # any cell at the node: all belong to one part
     against = np.zeros(len(number), dtype=np.int64)
     for cell, other, place, along in holds:
         both, twice = [part[cell]], 1
@@ -58,13 +58,13 @@ def check_held(
         number = np.concatenate([number, *both])
         against = np.concatenate([against, *(both[::-1] if twice == 2 else [np.zeros(len(cell), dtype=np.int64)])])
         x, direction = np.concatenate([x, *[place] * twice]), np.concatenate([direction, *[along] * twice])
-    x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
+    x = (x - centre[number - 1]) / size[number - 1, None]  # scaled, so that rotations of small distant parts count
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
-    if grid.axisymmetric:  # rings move rigidly along the axis only
+    if grid.axisymmetric:  # rings have one rigid-body mode, along the axis
         modes = [direction[:, 1]]
     R = np.stack(modes, axis=1)
-    held, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # the ground holds
+    held, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # entry 0: the ground
     while True:
         on = held[against]
         grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
@@ -82,15 +82,17 @@ def check_held(
             )
             raise ValueError(
                 f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
-                "it must touch walls whose components hold it, have given displacements, or touch tools, or "
-                "other groups that are held"
+                "it must be constrained by walls that it touches, by prescribed displacements, or by contact with "
+                "a tool or a constrained group"
             )
 
 
-def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres (count, d), m, and the largest edges (count,), m, of the boxes around the parts."""
-    low, high = np.full((2, count, grid.dim), np.inf)  # the higher ends with a minus
+def _extents(
+    grid: Grid, cells: NDArray[np.int64], part: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of parts."""
+    low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):
-        np.minimum.at(ends, part[part > 0] - 1, sign * grid.midpoints[part > 0])
+        np.minimum.at(ends, part, sign * grid.midpoints[cells])
         grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
     return (low - high) / 2, (-high - low + (grid.h if grid.even else grid.most)).max(axis=1)

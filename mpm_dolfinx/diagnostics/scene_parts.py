@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether the parts of which a scene is made go together."""
+"""Checks that the parts of a scene fit together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 
 
 def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
-    """Refuse what is no grid, bodies or materials, bodies outside of the grid, and `later` ones that are none."""
+    """Raise an error for invalid grid, bodies or materials, bodies outside the grid, or invalid `later` indices."""
     instance("grid", grid, Grid)
     all_of("bodies", bodies, Body, 1)
     all_of("materials", materials, Skeleton, 1)
@@ -29,7 +29,7 @@ def check_options(
     sources: Sequence[Callable],
     quadrature: str,
 ) -> None:
-    """Refuse terms and sources that are no functions, pressures and sources without fluid, and wrong quadratures."""
+    """Raise an error for invalid terms, sources or quadrature, and for pressures and sources without fluid."""
     turned = [i for i, body in enumerate(bodies) if not body.aligned]
     if quadrature == "point" and turned:
         raise ValueError(f"quadrature 'point': body {turned[0]} is mapped or a mesh, must be a box along the grid")
@@ -44,7 +44,7 @@ def check_options(
 
 
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides; what is no list of them as it is."""
+    """Return the functions of terms in bodies and on sides; an invalid list is returned unchanged."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]

@@ -206,9 +206,8 @@ class Reconstruction:
         return p[cells[slot]] + share_within(rise, low, high, slot)[slot] * rise
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return slopes of owned cells (n, d) in all local cells, ghosts included, zero in the others."""
+        """Return slopes of owned cells (n, d) in a local array, that of active ghosts included."""
         out = self._slope.x.array.reshape(-1, self.grid.dim)
-        out[:] = 0.0
         out[cells] = slope
         self._slope.x.scatter_forward()
         return out

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Waves and shaking: quiet sides, energies."""
+"""Waves and shaking: quiet boundaries, energies, error of a step."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tractions that sides have borne at rest, of bodies that are let go."""
+"""Reactions of sides at rest, applied as tractions once a body is released."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ def borne(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return ids (m,) and tractions (m, d), Pa per reference area, that points bear on sides at rest.
+    """Return point ids (m,) and tractions (m, d), Pa per reference area, that replace the reactions of sides at rest.
 
-    They are those of the stresses.  What these lack of force and moment to balance a part of the bodies, which
-    would go on pushing it, is made up for by rigid fields of tractions.
+    Tractions follow from the stresses.  Their resultant forces and moments may differ from equilibrium of a part of the
+    bodies, which would set it in motion.  Rigid-body fields of tractions remove this difference.
 
     Parameters
     ----------
     cut, points
-        The domains, cut, and the points.
+        Cut particle domains, and material points.
     stresses, surfaces
-        Total stresses (faces, k, k), Pa, on sides by their names, and these.
+        Total stresses (faces, k, k), Pa, on sides by name, and the sides.
     parts
-        Parts of the bodies.
+        Connected parts of the bodies.
     forces : (nodes, d), N
-        That sides bear at the owned nodes of this process, zero where something else does.
+        Reactions of the sides at the owned nodes of this process, zero at other nodes.
     held : (nodes, d)
-        Components that something else holds from now on.
+        Components that remain fixed.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))
@@ -58,7 +58,7 @@ def borne(
         if not over_all(grid.comm, int(here.sum())):
             continue
         free = over_all(grid.comm, held[: len(forces)][there].sum(axis=0)) == 0
-        if grid.axisymmetric:  # forces along the radius have no sum
+        if grid.axisymmetric:  # radial forces have no resultant
             free[0] = False
         sums = over_all(grid.comm, np.append(area[here] @ x[here], area[here].sum()))
         on_side, on_nodes = (
@@ -80,9 +80,9 @@ def borne(
 
 
 def _rigid(arm: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return rigid fields (k, n, d) at places (n, d), m, about their origin: shifts along what is free, and turns.
+    """Return rigid-body fields (k, n, d) at positions (n, d), m: translations along free axes, and rotations.
 
-    Of what is held along some axis no turn.
+    Rotations are left out if any axis is fixed.
     """
     n, d = arm.shape
     fields = [np.broadcast_to(e, (n, d)) for e in np.eye(d)[free]]

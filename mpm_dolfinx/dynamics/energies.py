@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Energies of bodies with inertia, and the work of what acts on them.
+"""Energies of bodies with inertia, and the work of forces on them.
 
-A step's work of forces f is dt sum b_i f_i . v_i over its substeps, with their velocities: as the method itself counts
-accelerations.  What kinetic energy and works do not balance by is lost to the method and to resets of the grid.
+The work of forces f in a step is dt sum b_i f_i . v_i over its substeps, with the weights b_i of the time integration.
+The remaining difference from the kinetic energy is numerical dissipation, of the method and of grid resets.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the kinetic and elastic energies, J, of points; on all processes together."""
+    """Return the kinetic and elastic energies, J, of points; all processes call it together."""
     mass = materials.present_density(points) * points.volume0 * points.J
     v, L = points.data[VELOCITY], velocity_gradients(points)
     spread = spreads(points.corners, materials.grid.axisymmetric)
@@ -30,9 +30,9 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 
 
 def begun(materials: SceneMaterials, points: MaterialPoints, kinetic: float) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, as works begin to count: see `Result.energies`; `internal` is the work of stresses.
+    """Return the energies, J, at the start of the count, see `Result.energies`; `internal`: work of the stresses.
 
-    kinetic: that of free tools, J.
+    kinetic: kinetic energy of free tools, J.
     """
     works = dict.fromkeys(("internal", "viscous", "friction", "external"), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)
@@ -46,10 +46,10 @@ def after(
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, after a step from those before it.
+    """Return the energies, J, after a step from the energies before it.
 
-    kinetic: that of free tools, J.
-    seconds, powers: times, s, in which the last powers count, W, on this process, see `MomentumProblem.powers`.
+    kinetic: kinetic energy of free tools, J; seconds: time weights of the substeps, s; powers: powers of the substeps
+    on this process, W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Quiet sides: t = t_0 - Z (v - 2 v_in), Z = rho c_p n n + rho c_s (I - n n), v_in of a wave that comes in.
+"""Quiet boundaries: t = t_0 - Z (v - 2 v_in), Z = rho c_p n n + rho c_s (I - n n), v_in: velocity of an incoming wave.
 
-t_0 is what the side bore at rest, a traction that stays (Lysmer and Kuhlemeyer 1969; incoming waves: Joyner and Chen
-1975).  Impedances are those of small strains, of soil and water that move together.
+t_0 is the constant traction at rest (Lysmer and Kuhlemeyer 1969; incoming waves: Joyner and Chen 1975).  Impedances use
+small-strain moduli of undrained soil.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 def traction_name(name: str) -> str:
-    """Return the name under which points have the traction (n, d), Pa, that a quiet side bore at rest."""
+    """Return the name of the point field with the traction (n, d), Pa, of a quiet side at rest."""
     return f"{name}_traction"
 
 
 class QuietForms:
-    """Points on quiet sides: impedances along the normal and beyond those across it, kg/m^2/s, and forces that stay."""
+    """Points on quiet sides: impedances across the normal and their excess along it, kg/m^2/s, and constant forces."""
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.points = p = FormPoints(grid, normal=(grid.dim,), across=(), along=(), force=(grid.dim,))
@@ -49,12 +49,12 @@ class QuietSides(Acting):
     Parameters
     ----------
     setting, sides
-        Where they are put, and the quiet sides by name.
+        Setting of the stage, and its quiet sides by name.
 
     Raises
     ------
     ValueError
-        Two act on the same part of a face.
+        Two quiet sides share a part of a face.
     """
 
     conditions, title = (Quiet,), "quiet sides"
@@ -69,20 +69,20 @@ class QuietSides(Acting):
             side.at(0.0, self._grid.dim)
 
     def named(self, names: Collection[str]) -> dict[str, Surface]:
-        """Return the faces of sides of some names."""
+        """Return the faces of the named sides."""
         return {name: faces for name, (_, faces) in self._sides.items() if name in names}
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces."""
+        """Faces of all quiet sides."""
         return [faces for _, faces in self._sides.values()]
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the tractions that n points keep, none."""
+        """Return initial point fields of n points: zero tractions at rest."""
         return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._sides}
 
     def placed(self, place: Place) -> Loads:
-        """Return their forces on the present surface."""
+        """Return the loads on the present surface."""
         rows, d = [], self._grid.dim
         points = place.points
         rho, shear = self._materials.present_density(points), self._materials.table(points, lambda m: m.shear)
@@ -112,13 +112,13 @@ class QuietLoads(Loads):
         self._forms, self._data = forms, data
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add the tractions that stay, and those of incoming waves."""
+        """Add constant tractions, and tractions of incoming waves."""
         self._forms.stays.assemble_vector(b, self._data)
 
     def resists(self, b: NDArray[np.float64]) -> None:
-        """Add what resists the velocity."""
+        """Add the viscous resistance."""
         self._forms.resists.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add its derivative."""
+        """Add the derivative of the viscous resistance."""
         self._forms.slope.assemble_matrix(K, self._data)

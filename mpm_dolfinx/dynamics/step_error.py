@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The error of a step of bodies with inertia, by its difference from a step of first order."""
+"""Error estimate of a step with inertia, from its difference to a first-order step."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ def motion_error(
     seconds: float,
     own: float,
 ) -> tuple[float, float]:
-    """Return the estimated error of a step's motion, and the motion itself, both as roots of twice an energy, J^(1/2).
+    """Return the estimated error of a step's motion, and the motion, both as square roots of twice an energy, J^(1/2).
 
-    The difference to a step of first order is seconds (a2 - a1) in the velocities, seconds (v2 - v1) in the
-    displacements.  The matrix of the substep makes it bounded for modes that the step does not resolve, as in Hosea and
-    Shampine (1996); the share ERROR of it counts.  A mode that a step resolves is off by 0.081 omega dt of it.
+    The difference to a first-order step is seconds (a2 - a1) in velocities and seconds (v2 - v1) in displacements.  The
+    matrix of the substep bounds it for unresolved modes, as in Hosea and Shampine (1996).  The estimate is the fraction
+    ERROR of this difference.  The error of a resolved mode is 0.081 omega dt times the difference.
 
     Parameters
     ----------
     solvers, K, mass
-        Of the last substep: solvers, tangent of the momentum, mass.
+        Solvers, momentum tangent and mass of the last substep.
     flights
-        After the two substeps.
+        States of motion after the two substeps.
     seconds, own
-        Times, s, in which the first rate of two counts, and the last one.
+        Time weights, s, of the first rate of two, and of the last rate.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

@@ -25,6 +25,7 @@ from mpm_dolfinx.base.fluid_content import density_between, mass_potential
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
+from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
@@ -212,7 +213,7 @@ class PieceContents:
 
 
 class CellContents(Keyed):
-    """What the cells hold since the grid was reset; arrays over local cells, ghosts included, zero where empty.
+    """What the cells hold since the grid was reset; arrays over the active local cells are meaningful.
 
     Parameters
     ----------
@@ -222,11 +223,15 @@ class CellContents(Keyed):
         What the pieces bring.
     filled
         Owned active cells.
+    active
+        These and the ghosts that are active.
     """
 
-    def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
+    def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64], active: NDArray[np.int64]):
         self.grid = grid = forms.grid
-        self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
+        self.active = active
+        self.filled = filled
+        self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
         self.volume = self.total(cells, weight)
@@ -237,9 +242,9 @@ class CellContents(Keyed):
         """Filled share of the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
-        for f in (forms.fixed_stress, *shapes):
-            f.x.array[:] = 0.0
-        forms.fixed_stress.x.array[filled] = self.total(cells, weight * pieces.fixed_stress)
+        self.fixed_stress = self.total(cells, weight * pieces.fixed_stress)
+        """Fixed-stress coefficient times volume (n,) of the filled cells."""
+        forms.fixed_stress.x.array[filled] = self.fixed_stress
         centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
         h, volume = grid.sizes(filled).T, grid.volumes(filled)
         for a in range(grid.dim):
@@ -249,11 +254,11 @@ class CellContents(Keyed):
                 target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * h[a] / volume
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
-        self.fixed_stress = forms.fixed_stress.x.array.copy()
-        """Fixed-stress coefficient times volume."""
         self._slopes = grid.shape_gradients(filled, grid.midpoints[filled] + centroid[filled])
         self._values = grid.shape_values(filled, grid.midpoints[filled] + centroid[filled])
-        self.centroid, self.open = centroid.copy(), np.stack([lower, upper], axis=2)
+        self.centroid, self.open = forms.active.centroid, forms.active.opening
+        self.centroid[active] = centroid[active]
+        self.open[active] = np.stack([lower[active], upper[active]], axis=2)
         """Centroids (c, d) of what the cells hold from their midpoints, m; open shares of their faces (c, d, 2)."""
 
     def total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -274,7 +279,6 @@ class CellContents(Keyed):
         Shares (n,) of it count, less what pores store by their saturation (n,), 1/Pa.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
-        tau.array[:] = 0.0
         tau.array[self.filled] = values
         tau.scatter_forward()
         return values
@@ -283,9 +287,17 @@ class CellContents(Keyed):
         """Return the means over the pieces (m,) of each filled cell."""
         return self.total(self._cells, self.weight * values) / self.volume
 
-    def motion(self, u: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m; nothing of some."""
-        nodal, hoop = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1), None
+    def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return u (nodes, d) at the nodes of the filled cells (n, d, 2^d)."""
+        return u[self._nodes].transpose(0, 2, 1)
+
+    @cached_property
+    def _nodes(self) -> NDArray[np.int32]:
+        return self.grid.cell_nodes[self.filled]
+
+    def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
+        """Return the motion of the filled cells at their centroids by `nodal` displacements, m; some may rest."""
+        hoop = None
         moved = np.einsum("ndk,nk->nd", nodal, self._values)
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
@@ -313,6 +325,8 @@ class FluxForms:
     ----------
     grid
         Background grid.
+    active
+        Its active part.
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     flows
@@ -330,6 +344,7 @@ class FluxForms:
     def __init__(
         self,
         grid: Grid,
+        active: Active,
         weight: ufl.core.expr.Expr | None,
         flows: bool,
         pressure: fem.Function,
@@ -343,6 +358,7 @@ class FluxForms:
         d = grid.dim
         Q = grid.cellwise()
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
+        self.active = active
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
         vectors = (fem.Function(grid.cellwise((d,))) for _ in range(5))
         self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face = vectors
@@ -424,15 +440,22 @@ class FluxForms:
                 self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
 
     def along(
-        self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]
+        self,
+        slope: NDArray[np.float64],
+        cells: NDArray[np.int64],
+        facets: FacetSum,
+        active: NDArray[np.int64],
+        density: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the outflow of the local cells (c,), m^d/s, by gradients (n, d), Pa/m, of some along some faces.
+        """Return the outflow of the local cells, m^d/s, by gradients (n, d), Pa/m, of some along some faces.
 
-        density (c,): of the fluid over that at zero pressure.
+        active, density: the active local cells (c,), and the density (c,) of their fluid over that at zero pressure.
         """
-        self.density.x.array[:] = density
-        self.slope.x.array[:] = self._sum.x.array[:] = 0.0
-        self.slope.x.array.reshape(-1, self.grid.dim)[cells] = slope
+        self.density.x.array[active] = density
+        self._sum.x.array[active] = 0.0
+        of_cells = self.slope.x.array.reshape(-1, self.grid.dim)
+        of_cells[active] = 0.0
+        of_cells[cells] = slope
         self.slope.x.scatter_forward()
         facets.assemble_vector(self._sum.x.array)
         return sum_ghosts(self._sum)
@@ -452,7 +475,6 @@ class FluxForms:
             moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
             values[self.moved] = moved if shift is None else moved - shift
         for f, rows in values.items():
-            f.x.array[:] = 0.0
             f.x.array.reshape(-1, d)[filled] = rows
             f.x.scatter_forward()
         if self.relative is not None:

@@ -184,14 +184,13 @@ class AslantFlow(NamedTuple):
     sides: OpenSides
     weight: NDArray[np.float64] | None
 
-    def __call__(
-        self, p: NDArray[np.float64], density: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what leaves the filled cells (n,) to others, m^d/s, at p (c,), Pa, and what open sides see.
 
-        The latter (m,), Pa, is what they see more than the pressure of their cell.  density (c,): of the fluid over
-        that at zero pressure.
+        The latter (m,), Pa, is what they see more than the pressure of their cell.  bulk: of the fluid, Pa.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
-        leaves = self.forms.along(slope, self.contents.filled[self.gradients.rows], self.facets, density)
-        return leaves[self.contents.filled], self.gradients.through_sides(slope, len(self.sides.cells))
+        filled, active = self.contents.filled, self.contents.active
+        density = np.exp(p[active] / bulk)
+        leaves = self.forms.along(slope, filled[self.gradients.rows], self.facets, active, density)
+        return leaves[filled], self.gradients.through_sides(slope, len(self.sides.cells))

@@ -52,7 +52,7 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the rate at which fluid comes to the local cells at p, m^d/s."""
+        """Return the rate at which fluid comes to the filled cells at p, m^d/s, in a local array."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
@@ -61,7 +61,7 @@ class Sources(Feeding):
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:
         b = self._work.x.array
-        b[:] = 0.0
+        b[pieces.places.filled] = 0.0
         for one in forms:
             one.assemble_vector(b, pieces)
         return b

@@ -51,25 +51,17 @@ from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts
-from mpm_dolfinx.pores.retention import Retentions, logarithm, pressure_at
+from mpm_dolfinx.pores.retention import Retentions, restrained
 
 FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
 
 Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
-"""
-
-
-FARTHEST = np.log(10)
-"""Change of the logarithm of the suction in a Newton step, at most; without one dry soil beside wet finds no solution.
-
-Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
-
-Plateau (dry): halved 7.6e-10, doubled 9.8e-10, cells 6.6e-03.
 """
 
 
@@ -100,6 +92,8 @@ class StorageForms:
         Increment of the displacement since the start of the step.
     pressure
         Pore pressure of the cells, positive in compression.
+    active
+        The active part of the grid.
     bulk
         Bulk modulus of the fluid, Pa.
     weight : (d,), N/m^3
@@ -126,6 +120,7 @@ class StorageForms:
         pieces: FormPoints,
         displacement: fem.Function,
         pressure: CellPressure,
+        active: Active,
         bulk: float,
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
@@ -168,39 +163,37 @@ class StorageForms:
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
         relative = Relative(pieces.grid, retentions) if self.retains and flows else None
-        self.fluxes = FluxForms(pieces.grid, weight, flows, self.p, bulk, inertial, relative)
+        self.fluxes = FluxForms(pieces.grid, active, weight, flows, self.p, bulk, inertial, relative)
         self.feeding = tuple(feeding)
         """What feeds the fluid in all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return the change of the fluid in each cell since the start of the step, m^d, a local array."""
+        """Return the change of the fluid in the filled cells since the start of the step, m^d, in a local array."""
         b = self._work.x.array
-        b[:] = 0.0
+        b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return its derivative by the cell's pressure, m^d/Pa, a local array, and those by displacements of its nodes.
+        """Return its derivative by the cell's pressure (filled cells,), m^d/Pa, and by displacements of its nodes.
 
         The latter (filled cells, n), m^(d-1), are first those of alpha dJ_Delta, which the momentum takes, then those
         of the content, where these are others.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         by_p, *by_u = np.split(sums, range(1, sums.shape[1], count), axis=1)
-        capacity = np.zeros_like(self.p.x.array)
-        capacity[data.places.filled] = by_p[:, 0]
-        return [capacity, *by_u]
+        return [by_p[:, 0], *by_u]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what the filled cells (n,) store by their saturation, m^d/Pa, and S d(chi p)/dp, m^d, at p."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
-    def driven(self, assembled: FacetSum) -> NDArray[np.float64]:
-        """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
+    def driven(self, assembled: FacetSum, active: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the outflow that p and the fluid's weight drive from active cells to others, m^d/s, a local array."""
         if self.fluxes.relative is not None:
             self.fluxes.relative.set_pressures(self.p.x.array)
-        self._work.x.array[:] = 0.0
+        self._work.x.array[active] = 0.0
         assembled.assemble_vector(self._work.x.array)
         if self.fluxes.relative is not None and self.fluxes.relative.borders is not None:
             self.fluxes.relative.borders.add_fluxes(self._work.x.array)
@@ -268,9 +261,7 @@ class StorageSystem:
         """Whether the matrix of the pressures alone is symmetric."""
         d = forms.grid.dim
         fluxes = forms.fluxes
-        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64))
-        self.local_parts = parts.cells
-        """Parts (cells,) of the local cells, -1 where they hold nothing."""
+        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), forms.grid.midpoints)
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
         """Parts of the unknowns."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
@@ -462,7 +453,7 @@ class StorageProblem:
     def _density(self) -> NDArray[np.float64]:
         """Density of the fluid halfway between start and end in the active owned cells, over that at zero pressure."""
         forms, owned = self.forms, self.system.unknowns.owned
-        return np.exp((forms.p.x.array + forms.p_n.x.array)[owned] / (2 * forms.bulk))
+        return np.exp((forms.p.x.array[owned] + forms.p_n.x.array[owned]) / (2 * forms.bulk))
 
     def outflows(self) -> dict[str, NDArray[np.float64]]:
         """Return what leaves the bodies by each condition at (u, p), m^d/s, by name."""
@@ -500,9 +491,7 @@ class StorageProblem:
 
     def sealed(self, lost: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much the cells' pressures would have risen, Pa, at fixed stress, by what they lost, m^d."""
-        owned = self.system.unknowns.owned
-        capacity = self.forms.derivatives(self.data)[0]
-        return lost / (capacity + self._contents.fixed_stress)[owned]
+        return lost / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what errors of the pressures (n,), Pa, make of the water content, and its change in the step (n,)."""
@@ -523,7 +512,7 @@ class StorageProblem:
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, beyond = 0.0, np.zeros(sum(sides))
         if outflow.aslant is not None:
-            between, beyond = outflow.aslant(p, np.exp(p / self.forms.bulk))
+            between, beyond = outflow.aslant(p, self.forms.bulk)
         parts = np.split(beyond, np.cumsum(sides)[:-1])
         for one, at, part in zip(self._feeds, outflow.at, parts, strict=False):
             one.begin(at, fluid, part)
@@ -535,22 +524,10 @@ class StorageProblem:
         return SAME if self.forms.retains else 1.0
 
     def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
-
-        Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for
-        the saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  The logarithm of the
-        suction changes by at most `FARTHEST`.
-        """
+        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,)."""
         if self._scale is None:
             return dp
-        p, turn = self.forms.p.x.array[self.system.unknowns.owned], -self._scale
-        there = p - dp
-        there = np.where((p - turn) * (there - turn) < 0, turn, there)
-        here, y = logarithm(p, self._scale), logarithm(there, self._scale)
-        far = (np.abs(y - here) > FARTHEST) & (np.minimum(here, y) < 0)
-        y = here + np.clip(y - here, -FARTHEST, FARTHEST)
-        there = np.where(far, pressure_at(y, self._scale), there)
-        return np.where(there == p - dp, dp, p - there)
+        return restrained(self.forms.p.x.array[self.system.unknowns.owned], dp, self._scale)
 
     def settle(self) -> bool:
         """Open and close what asks for it by the flow at (u, p); return whether that has changed anything.
@@ -566,11 +543,13 @@ class StorageProblem:
         """Assemble the fluxes at u."""
         self._flow(False)
 
-    def flux_slope(self, u: fem.Function, unknowns: Unknowns) -> FluxSlope:
+    def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
         """Return what gives the change (n,), m^d, of what the cells lose as displacements u change along a vector, m.
 
         Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
         taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
+
+        dofs: the active degrees of freedom of u.
         """
         h = self.forms.grid.least
         here, density = self._rates(self._flow(False)).cells, self._density
@@ -579,10 +558,10 @@ class StorageProblem:
             largest = v.norm(PETSc.NormType.NORM_INFINITY)
             if not 0 < largest < np.inf:
                 return np.zeros(len(here))
-            step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array.copy()
+            step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array[dofs]
             unknowns.add(u, step, v)
             there = self._rates(self._flow(False)).cells
-            u.x.array[:] = now
+            u.x.array[dofs] = now
             return self.dt * (there - here) / step / density
 
         return along
@@ -598,7 +577,8 @@ class StorageProblem:
         density = self._density
         b[owned] = change = density * b[owned] + self._due
         r = system.unknowns.gather(b, system.residual)
-        step = system.unknowns.gather(forms.p.x.array - forms.p_n.x.array, system.step)
+        step = system.step
+        step.array_w[:] = forms.p.x.array[owned] - forms.p_n.x.array[owned]
         if self.damped:
             system.D.multAdd(step, r, r)
         if self._softer is not None:
@@ -622,7 +602,7 @@ class StorageProblem:
         if system.gravity is None:
             cells = system.between(fluid.pi) + self._aslant
         else:
-            cells = self.forms.driven(system.gravity)[system.unknowns.owned] + self._aslant
+            cells = self.forms.driven(system.gravity, self._contents.active)[system.unknowns.owned] + self._aslant
         lost, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):
@@ -632,15 +612,13 @@ class StorageProblem:
         return Rates(cells + lost, lost, turnover, gain)
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
-        """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.
+        """Return the fluid (n,), m^d, that came to the filled owned cells in the step by fluxes and sources.
 
         Its volume is that at the density halfway between start and end, as in `change`.
 
         rates: at the end of the substep.
         """
-        out = np.zeros_like(self.forms.p.x.array)
-        out[self.system.unknowns.owned] = (-rates.taken(self.dt).cells - self._before.cells) / self._density
-        return out
+        return (-rates.taken(self.dt).cells - self._before.cells) / self._density
 
     def assemble_tangent(self, data: PointData | None = None) -> None:
         """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""
@@ -663,7 +641,7 @@ class StorageProblem:
             system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         slope = sum(one.slope(at, fluid) for one, at in both)
-        _add_diagonal(system.C, capacity[system.unknowns.owned] + self.dt * slope)
+        _add_diagonal(system.C, capacity + self.dt * slope)
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator C + factor (beta V - share L) for the present C.
@@ -680,7 +658,7 @@ class StorageProblem:
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         system.P.axpy(-factor * share, system.L, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        _add_diagonal(system.P, factor * self._contents.fixed_stress[system.unknowns.owned])
+        _add_diagonal(system.P, factor * self._contents.fixed_stress)
         return system.P
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tensors whose third axis is principal: those of plane strain and of axisymmetry, whose third axis is the hoops'."""
+"""Second-order tensors with a principal third axis: the out-of-plane or the circumferential direction."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import ufl
 
 
 def block(T):
-    """Return a UFL tensor (3, 3) of axisymmetry, written with zeros beside its third axis: `planar` sees these."""
+    """Return a UFL tensor (3, 3) with explicit zeros in its out-of-plane shear components; `planar` recognises it."""
     return ufl.as_matrix([[T[0, 0], T[0, 1], 0], [T[1, 0], T[1, 1], 0], [0, 0, T[2, 2]]])
 
 
@@ -24,7 +24,7 @@ def planar(F) -> bool:
 
 
 def embedded(F, across=1):
-    """Return a deformation gradient (3, 3): that of plane strain with a stretch across the plane, or itself."""
+    """Return a deformation gradient as (3, 3); a plane one takes `across` as its out-of-plane stretch."""
     if F.ufl_shape == (3, 3):
         return F
     return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, across]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Forces and matrices of cells: forms of Q1 vectors over points, summed in each cell before they are inserted.
+"""Nodal forces and element matrices: forms of Q1 vectors, summed over the points of each cell before insertion.
 
 Inserting the matrix of every point costs more than computing it.
 """
@@ -22,7 +22,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the cell's Q1 shape functions at the point as UFL, in 3D their means over a piece."""
+    """Return the gradients of the Q1 shape functions at the point as UFL; in 3D, their means over a piece."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []
@@ -40,7 +40,7 @@ def shape_gradients(points: FormPoints) -> list:
 
 
 def shape_hoops(points: FormPoints) -> list:
-    """Return N / r of the cell's Q1 shape functions N as UFL, in axisymmetry: their means, see `FormPoints.hoop`."""
+    """Return the means of N / r of the cell's Q1 shape functions N as UFL, in axisymmetry; see `FormPoints.hoop`."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
@@ -50,7 +50,7 @@ def shape_hoops(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v at the points as UFL, for the unit displacements v of each node along each axis."""
+    """Return T : grad v at the points as UFL, for the shape function of each node along each axis as v."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -75,14 +75,14 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add to `A`, which has a row a cell, values (cells, n) for the Q1 vectors of cells; the caller finalises it."""
+    """Add values (cells, n) for the Q1 vectors of cells to `A`, which has one row a cell; the caller finalises it."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return rows and columns of the entries of a matrix that are needed, and the place of every entry among them."""
+    """Return rows and columns of the stored entries of a matrix, and the index of each entry among the stored ones."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -103,19 +103,19 @@ class ElementForces:
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
-        self._grid = points.grid
         self._sums = CellSums(along_shapes(stress, points), points)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        dofs = element_dofs(self._grid, data.places.filled)
-        b += sum_by(dofs.ravel(), self._sums(data).ravel(), len(b))
+        """Add the vector to the local array `b`; contributions to ghosts stay in the ghost entries."""
+        dofs, at = data.places.dofs
+        b[dofs] += sum_by(at, self._sums(data).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):
-    """What is summed in the cells beside an element matrix A: kernels that share terms with A cost little.
+    """Further sums over the points of a cell, computed with an element matrix A: kernels share common terms.
 
-    along: UFL tensors (d, d) T[i, k] at the points, contracted as A is, with grad v or grad v F, for each displacement;
+    along: UFL tensors (d, d) T[i, k] at the points, contracted as A is: with grad v, or with grad v F, for each
+    displacement;
     scalars: UFL scalars at the points.
     """
 
@@ -129,9 +129,9 @@ NOTHING = Beside()
 class ElementMatrices:
     """The bilinear form grad v : A : grad u of Q1 vectors over points, summed in each cell before insertion.
 
-    Inserting the matrix of every point costs twice as much as computing it.  Here the entries of the
-    element matrix, A contracted with the gradients of the shape functions at the point, are tested
-    with DG0, so that the assembler sums them over the points of a cell; then each cell is inserted once.
+    Inserting the matrix of every point costs twice as much as computing it. The entries of the element matrix are A,
+    contracted with the gradients of the shape functions at the point. DG0 test functions make the assembler sum them
+    over the points of a cell. Each cell is then inserted once.
 
     Parameters
     ----------
@@ -140,9 +140,9 @@ class ElementMatrices:
     points
         The points.
     symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+        Whether A[i, k, j, l] = A[j, l, i, k]: only half of the entries are then computed.
     beside
-        What else is summed.
+        Further sums.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, by unrolled local dofs, and return the other sums (cells, quantities) in filled cells.
+        """Add the matrix to `A`, by unrolled local dofs; return the other sums (cells, quantities).
 
         The caller finalises the matrix.
         """
@@ -173,9 +173,9 @@ class ElementMatrices:
 
 
 def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
-    """Return what hoops add to an entry of an element matrix as UFL; row, column: node and axis of both displacements.
+    """Return the contribution of circumferential strains to an entry of an element matrix as UFL.
 
-    tangent (3, 3, 3, 3): as for `ElementMatrices`; gradients, hoops: of the shape functions.
+    tangent (3, 3, 3, 3): as for `ElementMatrices`; row, column: node and axis of the two displacements.
     """
     (v, i) = row
     (u, j) = column
@@ -190,16 +190,16 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 
 
 class StackedElementMatrices:
-    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors over points: kernels give A, BLAS contracts it.
+    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors over points: kernels evaluate A, BLAS contracts it.
 
-    For 3D, where cells hold many points: with the gradients g of the shape functions, times F, stacked over the
-    n points of a cell, its matrix is one product of an 8 x 3n with a 3n x 72 matrix.  Cells are taken in
-    batches of about as many points.
+    It serves 3D, where cells hold many points. The gradients of the shape functions, times F, are stacked over the n
+    points of a cell. The element matrix is then one product of an 8 x 3n with a 3n x 72 matrix. Each batch of cells
+    holds about the same number of points.
 
-    Hencky's law with 20 points a cell takes 4.2 us a point and 86 us a cell: 2.3 the kernel, 1.4 the products, 0.4
-    the insertion.  Inserting 24 x 24 entries a point took 13.8 us, 300 sums a cell as in `ElementMatrices` take 4.8
-    and twice the time to compile (13 s against 7 s; the former 15 s).  With the points of each octant of a cell
-    merged, 8 in a cell, Newton's method on a bending beam no longer converges.
+    Hencky's law with 20 points a cell takes 4.2 us a point and 86 us a cell: 2.3 the kernel, 1.4 the products, 0.4 the
+    insertion. Inserting 24 x 24 entries a point took 13.8 us. The 300 sums a cell of `ElementMatrices` take 4.8 us and
+    twice the time to compile (13 s against 7 s). Merging the points of each octant of a cell, 8 in a cell, costs the
+    convergence of Newton's method on a bending beam.
 
     Parameters
     ----------
@@ -208,9 +208,9 @@ class StackedElementMatrices:
     points
         The points, with the field F (d, d).
     symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+        Whether A[i, k, j, l] = A[j, l, i, k]: only half of the entries are then computed.
     beside
-        What else is summed.
+        Further sums.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, by unrolled local dofs, and return the other sums (cells, quantities) in filled cells.
+        """Add the matrix to `A`, by unrolled local dofs; return the other sums (cells, quantities).
 
         The caller finalises the matrix.
         """
@@ -240,7 +240,7 @@ class StackedElementMatrices:
         return sums
 
     def _of_batch(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the element matrices (cells, n, n) of a batch, and the other sums (cells, quantities)."""
+        """Return the element matrices (cells, n, n) of a batch of cells, and the other sums (cells, quantities)."""
         d, (cells, most) = self._d, missing.shape
         g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)
@@ -262,8 +262,9 @@ class StackedElementMatrices:
 
 
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
-    """Return batches of filled cells that hold about as many points: places of the cells among these (c,), points
-    (c, most), which are none.
+    """Return batches of cells with about as many points each: cells (c,), points (c, most), padding (c, most).
+
+    Cells are indices into `Places.filled`; padding is True beyond a cell's own points.
     """
     cells = places.cells
     filled = places.filled

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Forms at material points: any UFL form, evaluated where the points are.
+"""Forms at material points: any UFL form, evaluated at the positions of the points.
 
-A multilinear function on a box is a polynomial of degree d, so its Taylor series about the cell's
-midpoint ends after d terms: with xi = x_p - x_mid,
+A multilinear function on a box is a polynomial of degree d. Its Taylor series about the cell's midpoint ends after d
+terms. With xi = x_p - x_mid,
 
     v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   the right side taken at the midpoint.
 
-The right side is plain UFL, integrated by the one-point rule; xi and whatever else a point carries
-are DG0 coefficients, of which every entry of the integral's entity list has values of its own.
-Hence listing a cell as often as it has points, with one row of coefficients a point, makes the
-assembler call the kernel once a point, and int f w/|cell| dx over that list is sum_p w_p f(x_p).
-No generated code is touched.
+The right side is plain UFL, integrated by the one-point rule. The offset xi and all other data of a point are DG0
+coefficients. Each entry of the integral's list of entities has its own values of these coefficients.
+
+The list names a cell once for each of its points, with one row of coefficients a point. The assembler then calls the
+kernel once a point, and int f w/|cell| dx over that list is sum_p w_p f(x_p). Generated code is not modified.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Points whose element matrices are made at a time, in the processor's cache; those that an expression takes at a time.
+"""Points in one batch of element matrices, which fits into the processor's cache; points in one call of an expression.
 
-The latter where there are as many: kernels are called for all that a form is bound to.
+Few points take batches of the smaller size: a bound kernel is called for all of its cells.
 """
 
 
 class PointMeasure(ufl.Measure):
-    """Measure with a weight; of a sum over points, `f * dx` stands for sum_p w_p f(x_p)."""
+    """Measure with a weight, for sums over points: `f * dx` is sum_p w_p f(x_p)."""
 
     def __init__(self, mesh: Mesh, weight: ufl.core.expr.Expr, subdomain=_compat.SUBDOMAIN, degree: int = 0):
         super().__init__("dx", domain=mesh, subdomain_id=subdomain, metadata={"quadrature_degree": degree})
@@ -52,15 +52,14 @@ class PointMeasure(ufl.Measure):
 
 
 class FormPoints:
-    """What forms see of the points at which they are evaluated: coefficients, whose values come with the data.
+    """The points as seen by forms: UFL coefficients, whose values come with a `PointData`.
 
     Parameters
     ----------
     grid
         The background grid.
     fields
-        Name and shape of each quantity that the points carry; `points.name` is then a UFL
-        coefficient with the point's value.
+        Name and shape of each quantity of the points; `points.name` is its UFL coefficient.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -70,7 +69,7 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **_moments(grid), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
-        """What gives the values (n, size) of fields that change while the points stay."""
+        """Functions for the values (n, size) of fields that change while the points stay."""
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
@@ -82,17 +81,17 @@ class FormPoints:
         raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
-        """Return points in owned cells: see `PointData`; cells (n,), x (n, d) in m."""
+        """Return points in owned cells: see `PointData`; cells (n,), x (n, d) in m, weight (n,) in m^d."""
         return PointData(self, Places(self.grid, cells, x), weight, fields)
 
     def value(self, f):
-        """Return f at the point, f a Q1 function, test or trial function (any shape)."""
+        """Return f at the point; f is a Q1 function, test or trial function of any shape."""
         return self._taylor(f, self.grid.dim)
 
     def grad(self, f):
-        """Return grad f at the point, f a Q1 function, test or trial function (any shape).
+        """Return grad f at the point; f is a Q1 function, test or trial function of any shape.
 
-        Of a vector in axisymmetry (3, 3), with f_r / r.
+        The gradient of a vector in axisymmetry is (3, 3), with f_r / r on its diagonal.
         """
         plane = self.plane_grad(f)
         if not (self.grid.axisymmetric and f.ufl_shape):
@@ -100,27 +99,27 @@ class FormPoints:
         return ufl.as_matrix([[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, self.hoop(f)]])
 
     def plane_grad(self, f):
-        """Return grad f at the point, f a Q1 function, test or trial function, in axisymmetry in the plane."""
+        """Return grad f at the point as `grad` does, in axisymmetry without the circumferential component."""
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
     def hoop(self, f):
-        """Return f_r / r, f a Q1 vector, in axisymmetry: its mean over what the point stands for."""
+        """Return f_r / r of a Q1 vector f in axisymmetry: its mean over the piece of the point."""
         *offset, product, radius = (self.functions["hoop"][i] for i in range(4))
         slope = ufl.grad(f[0])
         return (f[0] + ufl.dot(slope, ufl.as_vector(offset)) + ufl.grad(slope)[0, 1] * product) / radius
 
     def gradient(self, u: fem.Function) -> fem.Function:
-        """Return grad u at the point, u a Q1 vector function, as a coefficient that numpy computes for the kernels.
+        """Return grad u at the point as a coefficient that numpy evaluates; u is a Q1 vector function.
 
-        Derivatives by u do not see it.  All forms at the same u share the values.  In 3D, where the Taylor series has
-        many terms, a kernel of Hencky's law takes half or a quarter of the time, and its compilation a fifth.
+        UFL derivatives with respect to u do not include it. All forms at the same u share its values. The Taylor series
+        has many terms in 3D. There a kernel of Hencky's law takes at most half of the time, its compilation a fifth.
         """
         if "gradient" not in self.live:
             self.follow("gradient", (self.grid.dim, self.grid.dim), lambda data: data.gradients(u))
         return self.functions["gradient"]
 
     def follow(self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray]) -> fem.Function:
-        """Return a new field as a coefficient; `values` gives those (n, size) of the points whenever a form is made."""
+        """Return a new field as a coefficient; each assembly calls `values` for its values (n, size) at the points."""
         self.functions[name] = self.grid.coefficient(shape)
         self.live[name] = values
         return self.functions[name]
@@ -134,14 +133,14 @@ class FormPoints:
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
     def moved_by(self, u: fem.Function):
-        """Return u at the points as UFL, in cells of many sizes as a coefficient: for forms called for other cells."""
+        """Return u at the points as UFL; on grids of many cell sizes as a coefficient, for reuse in other cells."""
         if self.grid.even:
             return self.value(u)
         d = self.grid.dim
         return self.follow("displaced", (d,), lambda data: self.grid.at(data.cells, data.x, u.x.array.reshape(-1, d)))
 
     def deformation(self, u: fem.Function):
-        """Return F = Delta F_n at the points, which carry F_n as F, as a UFL variable."""
+        """Return F = Delta F_n at the points as a UFL variable; F_n is the field `F` of the points."""
         F = self.increment(u) * self.F
         return ufl.variable(block(F) if self.grid.axisymmetric else F)
 
@@ -156,12 +155,12 @@ class FormPoints:
 
 
 def _moments(grid: Grid) -> dict[str, tuple[int, ...]]:
-    """Return name and shape of the moments that points carry in 3D and in axisymmetry, see `cutting.Pieces`."""
+    """Return name and shape of the geometric moments of points in 3D and in axisymmetry; see `cutting.Pieces`."""
     return {"mixed": (3,)} if grid.dim == 3 else {"hoop": (4,)} if grid.axisymmetric else {}
 
 
 class Places(Keyed):
-    """Where points lie; nobody changes it.
+    """Positions of points and their cells; immutable.
 
     Parameters
     ----------
@@ -170,9 +169,9 @@ class Places(Keyed):
     x : (n, d), m
         Positions.
     mixed : (n, d), m^2
-        In 3D mean products of offsets of pieces about them, see `Pieces`; None for points.
+        Mean products of the offsets within a piece about its centroid, in 3D; see `Pieces`. None: zero.
     hoop : (n, 4)
-        Of axisymmetric pieces their moments in the plane, see `Pieces`; without it, those of points.
+        Moments of axisymmetric pieces in the plane, see `Pieces`. None: moments of points.
     """
 
     def __init__(
@@ -192,7 +191,7 @@ class Places(Keyed):
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
         self.hoop = hoop
         self.filled, self.slots = np.unique(cells, return_inverse=True)
-        """The cells that hold points; and the place of each point's cell among these."""
+        """Cells that hold points; index of each point's cell among these."""
 
     @cached_property
     def nodal(self) -> NDArray[np.intp]:
@@ -200,18 +199,25 @@ class Places(Keyed):
         d = self.grid.dim
         return (self.grid.cell_nodes[self.filled] * d + np.arange(d)[:, None, None]).transpose(0, 2, 1).copy()
 
+    @cached_property
+    def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Unrolled local dofs (n,) of Q1 vectors in the filled cells, and indices of each cell's dofs among them."""
+        d = self.grid.dim
+        nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
+        return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
+
     def part(self, rows: NDArray[np.int64]) -> Places:
-        """Return some of the places."""
+        """Return the places of the points `rows`."""
         mixed, hoop = (None if values is None else values[rows] for values in (self.mixed, self.hoop))
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at some of the points, or means over pieces."""
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at points, or means over pieces."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
     def products(self, axis: int) -> list[tuple[int, NDArray[np.float64] | float]]:
-        """Return the products (n,) of offsets along sets of the other axes, see `Grid.monomials`; means over pieces."""
+        """Return products (n,) of offsets along sets of the other axes, or means: see `Grid.monomials`."""
         others = [a for a in range(self.grid.dim) if a != axis]
         out = [(0, 1.0), *((1 << a, self.offset[:, a]) for a in others)]
         if len(others) == 2:
@@ -220,7 +226,7 @@ class Places(Keyed):
         return out
 
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m, in axisymmetry: see `FormPoints.hoop`."""
+        """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m: see `FormPoints.hoop`."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
         h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
         hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
@@ -229,18 +235,18 @@ class Places(Keyed):
 
 
 class PointData(Keyed):
-    """Points with weights and fields, complete when made; nobody changes it.
+    """Points with weights and fields; immutable.
 
     Parameters
     ----------
     points
-        What forms see of them.
+        The coefficients of the forms.
     places
-        Their cells and positions.
+        Cells and positions of the points.
     weight : (n,), m^d
         Volumes.
     fields
-        Name and values (n, ...) of all fields of the points; those of other names are left out.
+        Name and values (n, ...) of the points' fields; other names are ignored.
     """
 
     def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
@@ -258,12 +264,12 @@ class PointData(Keyed):
         self._gradients: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
-        """Return some of the points, at `places`, with those fields that `points` have."""
+        """Return the points `rows`, at `places`, with the fields of `points`."""
         fields = {name: self._rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 
     def having(self, **fields: NDArray[np.float64]) -> PointData:
-        """Return the same points with other values (n, ...) of some fields."""
+        """Return the same points with new values (n, ...) of some fields."""
         kept = {name: self._rows[name] for name in self.points.sizes}
         return PointData(self.points, self.places, self.volume, kept | fields)
 
@@ -272,25 +278,29 @@ class PointData(Keyed):
         return self._rows[name]
 
     def gradients(self, u: fem.Function) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector function at its present values."""
-        now = u.x.array.copy()  # of the key nothing changes
-        return self._gradients(now, lambda: self.gradients_of(now))
+        """Return the gradients (n, d^2) of a Q1 vector function at its present values, which it keeps."""
+        nodal = u.x.array.take(self.places.nodal)
+        return self._gradients(nodal, lambda: self._of_nodal(nodal))
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u (n, 9), in axisymmetry with hoops, of a Q1 vector function with these values."""
+        """Return I + grad u (n, 9) of a Q1 vector with nodal values u, with the circumferential stretch."""
         out = np.zeros((len(self.cells), 3, 3))
         out[:, :2, :2] = np.eye(2) + self.gradients_of(u).reshape(-1, 2, 2)
         out[:, 2, 2] = self.places.stretch(u.reshape(-1, 2))
         return out.reshape(len(out), 9)
 
     def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector function with these values, a local array."""
+        """Return the gradients (n, d^2) of a Q1 vector function with nodal values u, a local array."""
+        return self._of_nodal(u.take(self.places.nodal))
+
+    def _of_nodal(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients from values at the nodes of the filled cells, see `Places.nodal`."""
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim
-        of_cells = grid.over_edges(grid.monomials @ u.take(places.nodal), places.filled)
+        of_cells = grid.over_edges(grid.monomials @ nodal, places.filled)
         out = np.empty((len(self.cells), d, d))
-        # component by component: rows of a few numbers each would take numpy six times as long
+        # one component at a time: numpy takes six times as long for rows of a few numbers
         for axis in range(d):
             along = 0.0
             for others, product in places.products(axis):
@@ -330,11 +340,11 @@ class Rows:
         self._packed = Latest()
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
-        """Return the present values of those fields of the form that change while the points stay."""
+        """Return the present values of the form's fields that change while the points stay."""
         return {name: values(data) for name, values in self._live.items()}
 
     def room(self, size: int) -> NDArray[np.float64]:
-        """Return the memory of the rows, at least `size` of them; what is kept saves the page faults of every step."""
+        """Return the buffer of the rows, at least `size`; it is kept between steps, because new memory is slow."""
         if self._room.value is None or size > len(self._room.value):
             self._packed.clear()
             return self._room(size, lambda: np.zeros((size, self._width)))
@@ -362,14 +372,14 @@ class Rows:
         return rows
 
     def _pack(self, rows: NDArray[np.float64], data: PointData, chosen: slice | NDArray[np.int64]) -> bool:
-        """Set the columns that stay while the points do."""
+        """Set the columns of the fields that are constant while the points stay."""
         for columns, name in self._columns:
             if name not in self._live:
                 rows[:, columns] = data[name][chosen]
         return True
 
     def _dofs_of(self, cells: NDArray[np.int32]) -> list[tuple[slice, fem.Function, NDArray[np.intp]]]:
-        """Return where the values of grid functions are: unrolled, in numpy's own index type, which it else makes."""
+        """Return columns, function and unrolled dofs of grid functions; numpy's own index type avoids copies."""
         out = []
         for columns, f, dofs in self._gathered:
             bs = f.function_space.dofmap.bs
@@ -379,17 +389,17 @@ class Rows:
 
 
 class PointForm:
-    """A form over `points.dx`, compiled once, assembled wherever the points are.
+    """A form over `points.dx`: compiled once, assembled for any positions of the points.
 
     Parameters
     ----------
     form
-        Linear or bilinear UFL form whose integrals are all over `points.dx`.
+        Linear or bilinear UFL form; all of its integrals are over `points.dx`.
     points
         The points.
     dense
-        Tested by DG0, it has a value for each of the filled cells rather than for each cell of the grid: as
-        `PointExpression`, it is called for other cells, which must be equal.
+        Number the values of a DG0 test function by the cells that hold points, and not by all cells of the grid.
+        Kernels are then called for other cells, as in `PointExpression`: all cells must be equal.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -397,7 +407,7 @@ class PointForm:
         self._rows, self._bound = Rows(self.compiled, points), Latest()
 
     def _parts(self, data: PointData) -> Iterator[tuple]:
-        """Yield the form bound to one chunk of points after the other, with their rows."""
+        """Yield the form bound to one chunk of points after the other, with the coefficients of each chunk."""
         cells, live = data.places.slots if self._dense else data.cells, self._rows.live(data)
         parts = in_chunks(len(cells))
         bound = self._bound(cells, lambda: [self.compiled.bind(cells[part]) for part in parts])
@@ -405,7 +415,7 @@ class PointForm:
             yield form, self._rows(data, part, live)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay there."""
+        """Add the vector to the local array `b`; contributions to ghosts stay in the ghost entries."""
         for form, rows in self._parts(data):
             self.compiled.assemble_vector(b, rows, form)
 
@@ -416,7 +426,7 @@ class PointForm:
 
 
 class FacetForm:
-    """A form over faces between active cells, or over these, compiled when first a process has such an entity.
+    """A form over faces between active cells, or over active cells; compiled when a process first has one.
 
     Parameters
     ----------
@@ -432,11 +442,11 @@ class FacetForm:
 
     @property
     def used(self) -> bool:
-        """Whether the form has been needed so far."""
+        """Whether the form has been compiled so far."""
         return "compiled" in vars(self)
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
-        """Return the form over the facets of this process; all processes ask together, for they compile together."""
+        """Return the form over the facets of this process. The call is collective, because compilation is."""
         make = partial(FacetSum, self, facets)
         return self._last(facets, lambda: make(self._comm.allreduce(len(facets)) > 0), self._comm)
 
@@ -447,7 +457,7 @@ class FacetForm:
 
 
 class FacetSum:
-    """A form over some facets; some: whether any process has one."""
+    """A form over some facets; some: whether any process has facets."""
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
         self._of = form
@@ -465,17 +475,17 @@ class FacetSum:
             self._of.compiled.assemble_matrix(A, None, self._bound)
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay there."""
+        """Add the vector to the local array `b`; contributions to ghosts stay in the ghost entries."""
         if self._bound is not None:
             self._of.compiled.assemble_vector(b, None, self._bound)
 
 
 class PointExpression:
-    """A UFL expression of the fields that points carry, evaluated at every point.
+    """A UFL expression of the fields of points, evaluated at every point.
 
-    The kernel sees of its cell the size only, by which it is divided: of grid functions expressions have no gradients,
-    but where all cells are equal.  So it is called for as many different cells, whichever, and DG0, which tests the
-    expression, keeps a value for each point.
+    The kernel depends on its cell by the cell's volume only, by which the result is divided. Gradients of grid
+    functions are therefore allowed only where all cells are equal. The kernel is called for as many arbitrary cells as
+    there are points. The DG0 test function then keeps one value for each point.
 
     Parameters
     ----------
@@ -505,7 +515,7 @@ class PointExpression:
     def evaluate(
         self, data: PointData, chosen: NDArray[np.int64] | None = None, live: dict[str, NDArray] | None = None
     ) -> NDArray[np.float64]:
-        """Return the values (m, *shape) at the chosen points, by default all; live: as `live` gives it."""
+        """Return the values (m, *shape) at chosen points, by default all; live: the result of `live`, if known."""
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)
         out, start = np.empty((count, self._values.shape[1])), 0
@@ -522,7 +532,7 @@ class PointExpression:
 
 
 class CellSums:
-    """Sums over the points of each cell: DG0 tests them, so that the assembler adds them up.
+    """Sums over the points of each cell: DG0 test functions make the assembler add them up.
 
     Parameters
     ----------
@@ -539,7 +549,7 @@ class CellSums:
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) in the filled cells of the points."""
+        """Return the sums (cells, quantities) in the cells that hold points."""
         if not self._grid.even:
             sums = np.zeros((self._grid.num_local, self._count))
             self._form.assemble_vector(sums.reshape(-1), data)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The unknowns that a step has: its own numbering, vectors and matrices.
+"""The unknowns of a step: their numbering, vectors and matrices.
 
-Functions live on the whole grid; vectors, matrices and factors hold only the free degrees of freedom
-of active nodes or cells.  A local-to-global map with -1 for every other degree of freedom lets
-dolfinx assemble straight into them: PETSc ignores negative indices.
+Functions live on the whole grid. Vectors, matrices and factors hold only the free degrees of freedom of active nodes or
+cells. The local-to-global map has -1 for all others, which PETSc ignores: dolfinx assembles straight into them.
 """
 
 from __future__ import annotations
@@ -19,17 +18,20 @@ from mpm_dolfinx.base import _compat
 
 
 class Unknowns:
-    """Numbering of some of the degrees of freedom of a function's space.
+    """Numbering of a subset of the degrees of freedom of a function's space.
 
     Parameters
     ----------
     function
-        Any function of the space; its ghost pattern is used.
+        Any function of the space, for its ghost pattern.
     dofs
-        Unrolled local degrees of freedom, ghosts included, that are unknowns.
+        Unrolled local degrees of freedom that are unknowns, ghosts included.
+    x : (entities, d), m
+        Positions of this process's nodes or cells; None: the space computes all of them on each request.
     """
 
-    def __init__(self, function: fem.Function, dofs: NDArray[np.int64]):
+    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
+        self._x = x
         self._space = space = function.function_space
         self.comm = space.mesh.comm
         owned = space.dofmap.index_map.size_local * space.dofmap.bs
@@ -61,11 +63,12 @@ class Unknowns:
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Where the entries of the vectors are (n, d), m."""
-        return self._space.tabulate_dof_coordinates()[self.owned // self.dim, : self._space.mesh.geometry.dim]
+        """Positions (n, d), m, of the entries of the vectors."""
+        x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
+        return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return a new vector with these entries of this process."""
+        """Return a new vector with the given entries of this process."""
         v = self.vector()
         v.array_w[:] = values
         return v
@@ -85,13 +88,13 @@ class Unknowns:
         return out
 
     def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
-        """Add scale * v to a function, ghosts updated; scale: one number, or one for each entry."""
+        """Add scale * v to a function and update its ghosts; scale: one number, or one for each entry."""
         function.x.array[self.owned] += scale * v.array_r
         function.x.scatter_forward()
 
 
 def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:
-    """Return an empty sparse matrix for assembly, with room for `row_length` entries a row, or in each row."""
+    """Return an empty sparse matrix for assembly, with room for `row_length` entries in each row."""
     A = PETSc.Mat().create(rows.comm)
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
@@ -104,23 +107,23 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
 
 
 def zero(A: PETSc.Mat) -> None:
-    """Empty a matrix for assembly, whether it was assembled before or not."""
+    """Set a matrix to zero before assembly, whether or not it has been assembled before."""
     if A.assembled:
         A.zeroEntries()
 
 
 def collect_garbage(comm: MPI.Intracomm) -> None:
-    """Free the PETSc objects that Python has dropped on all processes, together: PETSc keeps them until it is asked.
+    """Free the PETSc objects that Python has dropped on all processes. The call is collective.
 
-    On several processes their order of going may differ from one to the other; releases before 3.20 or so keep
-    those of a single process too.  Without this, a run keeps the matrices and factors of all its steps.
+    On several processes PETSc keeps dropped objects, because their order may differ between processes. Releases before
+    3.20 or so also keep the objects of a single process. Without this call a run keeps the matrices of all its steps.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)
 
 
 def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
-    """Add up what other processes assembled into ghosts; return the function's local array."""
+    """Add the ghost contributions of other processes to the owned entries; return the function's local array."""
     if function.function_space.mesh.comm.size > 1:
         _compat.scatter_reverse_add(function)
     return function.x.array

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The velocity of the bodies in a substep, for forms that ask for it."""
+"""The velocity of the solid in a substep, for forms that depend on it."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from numpy.typing import NDArray
 
 
 class Velocity:
-    """The velocity (u - past) / own at the end of a substep; of backward Euler past is 0, and own the step.
+    """The velocity (u - past) / own at the end of a substep; in backward Euler past is 0 and own is the step's length.
 
     Parameters
     ----------
     u
-        Increment of the displacement in the step, m.
+        Displacement increment of the step, m.
     """
 
     def __init__(self, u: fem.Function):
         self._u, self._past = u, fem.Function(u.function_space)
         self._own = fem.Constant(u.function_space.mesh, 1.0)
         self.value = (u - self._past) / self._own
-        """As UFL, m/s."""
+        """UFL expression, m/s."""
 
     @property
     def nodal(self) -> NDArray[np.float64]:
-        """Values (unknowns,) at the nodes, a local array, m/s."""
+        """Nodal values (unknowns,), a local array, m/s."""
         return (self._u.x.array - self._past.x.array) / float(self._own.value)
 
     def among(self, form: ufl.Form) -> bool:
-        """Return whether a form depends on it."""
+        """Return whether a form depends on the velocity."""
         return self._past in form.coefficients()
 
-    def set(self, own: float, past: float) -> None:
-        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it."""
+    def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
+        """Set the coefficients of the rate: own, the time increment, s, and past, a fraction of the present u.
+
+        dofs: the active degrees of freedom.
+        """
         self._own.value = own
-        self._past.x.array[:] = past * self._u.x.array
+        self._past.x.array[dofs] = past * self._u.x.array[dofs]

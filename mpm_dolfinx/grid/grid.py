@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The background grid: a box of quadrilaterals or hexahedra between lines along the axes.
+"""Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-Where cells are equal points are found in them by arithmetic, else by searching the lines of each axis.  What depends on
-the size of a cell asks for `sizes`, `volumes` and their like: of equal cells these are one row, `h`, or one number.
+Points are located in equal cells by arithmetic, in other grids by a search along each axis.  Cell sizes come from
+`sizes`, `volumes` and similar methods.  For equal cells these return a single row, `h`, or a single number.
 
-Its mesh is made when first it is needed: by then a simulation has shared out the cells by the points in them.
+The mesh is made at its first use.  By then a simulation has distributed the cells by the number of points in them.
 """
 
 from __future__ import annotations
@@ -30,52 +30,52 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
-REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
+REACH = 1e-4  # cells: tolerance for bodies beyond the grid, as a penalty moves a side onto a wall with this error
 
 TURN = 2 * np.pi
-"""The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of.  Source: definition."""
+"""Angle of the revolution of axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
-"""Rows that are worked on at a time: no temporary holds one for each point of a large body."""
+"""Rows processed at a time, to bound the size of temporary arrays."""
 MOST = 2**31 - 1
-"""Unknowns that PETSc's numbers of 32 bits count."""
+"""Largest number of unknowns for PETSc's 32-bit integers."""
 SNAP = 1e-10
-"""Cells: vertices this close to a grid plane, or as close as rounding tells, lie on it: far below what answers tell."""
+"""Cells: distance to a grid plane below which a vertex lies on it, if rounding is smaller; below any visible effect."""
 ORDER = "the order is Grid(lower, upper, cells)"
-MANY = "grid: h of cells of many sizes: must be asked of each cell, see sizes"
+MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
-    """Return (axis, end) of a named side of a box."""
+    """Return (axis, end) of a side of a box by its name."""
     if not isinstance(name, str) or name not in SIDES[dim]:
         raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
     return SIDES[dim][name]
 
 
 def in_chunks(count: int) -> list[slice]:
-    """Return so many rows in parts of at most CHUNK, one after the other; none of no rows."""
+    """Return consecutive slices of at most CHUNK rows; an empty list for no rows."""
     return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (size,) of values by index (numpy's bincount, which gives integers for no values)."""
+    """Return the sums (size,) of values by index, as floats also for no values (numpy's bincount gives integers)."""
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the range (n,) of each whole number in ranges (m,), and the numbers (n,): count of them from first on."""
+    """Return all numbers (n,) of ranges (m,) given by first number and count, and the range (n,) of each number."""
     of = np.repeat(np.arange(len(count)), count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) are among chosen ones (m,), ascending: numpy's isin makes room for all numbers."""
+    """Return which numbers (...) occur in sorted `chosen` (m,), without the large tables of numpy's isin."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(np.searchsorted(chosen, numbers), len(chosen) - 1)] == numbers
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return the edges across a face, m, of the cells beside it, "+" and "-", and their mean, as UFL; n: its normal."""
+    """Return the edges normal to a face, m, of its "+" and "-" cells, and their mean, as UFL; n: face normal."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -84,13 +84,13 @@ def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
 
 
 class Cells:
-    """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
+    """The cells of a grid on this process, ghosts included, in the numbering of the mesh.
 
-    num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
-    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs
-    (2^d, d): on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way
-    back, -1 where there is none; owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells
-    (facets, 2): -1 where there is none; sizes (cells, d): their edges, m, where these are of many sizes.
+    num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): nodes in the numbering of Q1
+    degrees of freedom; node_x (nodes, d), midpoints (cells, d): positions relative to the grid's base, m; signs (2^d,
+    d): direction from the midpoint to each node; cell_number (cells,): lexicographic numbers; locals: the inverse of
+    it, -1 for cells of other processes; owners: rank of each cell, copy by copy; cell_facets (cells, 2d); facet_cells
+    (facets, 2): -1 on the boundary; sizes (cells, d): edges, m, None for equal cells.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -103,8 +103,8 @@ class Cells:
         self.node_x = nodes.tabulate_dof_coordinates()[:, :d]
         corners = self.node_x[self.cell_nodes]
         self.midpoints = corners.mean(axis=1)
-        # all cells list their vertices in the same order (tested), so one set of signs serves all, also a process
-        # without a cell: it compiles the same forms
+        # all cells list their vertices in the same order (tested), so all processes compile the same forms, even a
+        # process without a cell
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
         self.cell_number = grid.number(grid.index_from_base(self.midpoints))
         if grid.copies > 1:
@@ -116,7 +116,7 @@ class Cells:
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
-        if d == 3 and grid.comm.size > 1:  # all together: else who first integrates over a facet waits for who has none
+        if d == 3 and grid.comm.size > 1:  # collective: a process without facets would never call it
             topology.create_entity_permutations()
         self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
         adjacency = topology.connectivity(d - 1, d)
@@ -126,20 +126,20 @@ class Cells:
         self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
         self.facets_owned = topology.index_map(d - 1).size_local
         self.cellwise = cache(partial(_compat.function_space, mesh, "DG", 0))
-        """Spaces by the shapes of their values, each made once, as are the functions whose memory others share."""
+        """Function spaces by value shape, each made once, and one function of each shape with shared memory."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
 
 
 def of_cells(name: str) -> property:
-    """Return a property of a grid that is one of its `Cells`."""
+    """Return a property of a grid that reads an attribute of its `Cells`."""
     return property(lambda grid: getattr(grid._of_process, name))
 
 
 class Grid:
-    """Background grid over the box [lower, upper]: of equal cells, or of those between given lines.
+    """Background grid over the box [lower, upper], with equal cells or with cells between given lines.
 
-    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls of a scene:
-    "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
+    Bodies must stay inside.  Empty cells cost next to nothing.  The sides of the grid are the walls of a scene: "left",
+    "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
 
     Parameters
     ----------
@@ -150,37 +150,37 @@ class Grid:
     comm
         Processes that share the grid.
     lines : (n,) along each axis, m
-        In place of the first three: the coordinates of all grid lines along each of d axes, ascending; see `graded`.
-        Lines that are equally far apart along all axes are the grid of equal cells.
+        Ascending coordinates of all grid lines, instead of `lower`, `upper` and `cells`; see `graded`.  Lines of equal
+        spacing along all axes give the grid of equal cells.
     axisymmetric
-        The first axis is the radius r >= 0 and the second the axis of revolution: bodies are what the plane sweeps as
-        it turns once, without torsion.  Volumes, forces and outflows are those of the whole revolution, m^3, N, m^3/s.
-        Where the grid begins at r = 0 its side "left" is the axis, which stays where it is.
+        The first axis is the radius r >= 0, the second the axis of revolution.  The scene has no torsion.  Volumes,
+        forces and outflows belong to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side
+        "left" is the axis and has no radial displacement.
 
     Raises
     ------
     ValueError
-        Corners or lines that are not finite or not in order, numbers of cells that are no integers >= 1, more cells
-        than PETSc's numbers count, or an axisymmetric grid in 3D or beyond its axis.
+        Corners or lines that are not finite or not ascending, numbers of cells that are not integers >= 1, more nodes
+        than PETSc can number, or an axisymmetric grid in 3D or with r < 0.
 
     Attributes
     ----------
     dim, shape, lower, upper
-        d; cells along each axis (d,); corners (d,), m.
+        d; number of cells along each axis (d,); corners (d,), m.
     even, lines, widths
-        Whether all cells are equal; the lines (n,), m, along each axis, counted from `base`; where cells have many
-        sizes, their edges (n - 1,), m, along each axis.
+        Whether all cells are equal; lines (n,), m, along each axis, relative to `base`; edges (n - 1,), m, along each
+        axis if the cells differ.
     snap
-        Distance to a grid plane, along each axis (d,), below which a vertex is taken to lie on it, cells.
+        Distance (d,) to a grid plane along each axis, in cells, below which a vertex lies on the plane.
     base, low, high
-        Place (d,), m, from which all places count that are kept of bodies on the grid, so that none of their digits are
-        lost far from the origin: the lower corner, but for a radius; and the corners, counted from there.
+        Origin (d,), m, of all internal positions of bodies, which keeps their digits far from the true origin: the
+        lower corner, with a radius of 0 in axisymmetry; and the corners relative to it.
     stretches
-        Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
+        Dimension of deformation gradients: d, in axisymmetry 3, with the circumferential stretch as the third.
     mesh
-        The dolfinx mesh, of coordinates that count from `base`; made when first it is needed.  On several processes a
-        second scene whose points lie elsewhere has a grid with a mesh of its own, `Simulation.grid`; not one with terms
-        or sources, which may be made on this.
+        The dolfinx mesh, with coordinates relative to `base`, made at its first use.  On several processes, a second
+        scene with another distribution of points has its own mesh and grid, `Simulation.grid`.  Scenes with terms or
+        sources always keep this mesh, because these may be defined on it.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Grid:
         self.even = lines is None
         if not self.even:
             if any(value is not None for value in (lower, upper, cells)):
-                raise ValueError("grid: lines are given, must have no lower, upper and cells beside them")
+                raise ValueError("grid: lines are given, lower, upper and cells must not be")
             lines = checked(lines)
             self.even = all(map(equal, lines))
             lower, upper, cells = ([of(x) for x in lines] for of in (np.min, np.max, lambda x: len(x) - 1))
@@ -226,7 +226,7 @@ class Grid:
             self.lines = tuple(x - start for x, start in zip(lines, self.base, strict=True))
             self.widths = tuple(map(np.diff, self.lines))
         self.finest = self._h if self.even else np.array([w.min() for w in self.widths])
-        """Shortest edges (d,), m, along each axis: of equal cells the edges."""
+        """Shortest edges (d,), m, along each axis."""
         self.least, self.most = float(self.finest.min()), float(max(map(np.max, self._h if self.even else self.widths)))
         """Shortest and longest edge of a cell, m."""
         self.snap = np.maximum(SNAP, [rounding(e) for e in zip(self.lower, self.upper, strict=True)] / self.finest)
@@ -235,55 +235,55 @@ class Grid:
 
     @cached_property
     def lines(self) -> tuple[NDArray[np.float64], ...]:
-        """The lines (n,), m, along each axis, counted from the base."""
+        """Lines (n,), m, along each axis, relative to the base."""
         return tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self.h, strict=True))
 
     @property
     def h(self) -> NDArray[np.float64]:
-        """Edges (d,), m, of all cells, where these are equal."""
+        """Edges (d,), m, of equal cells."""
         if self._h is None:
             raise ValueError(MANY)
         return self._h
 
     @cached_property
     def cell_volume(self) -> float:
-        """Volume of every cell, where these are equal, in axisymmetry its area in the plane (m^d)."""
+        """Volume, m^d, of equal cells; in axisymmetry the area in the plane."""
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of local cells; of equal cells one row, (d,)."""
+        """Return the edges (n, d), m, of local cells; one row (d,) for equal cells."""
         return self._h if self.even else self._of_process.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edges (n,), m, of local cells (n,) along an axis, one for all or each its own (n,)."""
+        """Return the edges (n,), m, of local cells (n,) along one axis, or along an axis for each (n,)."""
         return self.h[axis] if self.even else self._of_process.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), m, of the midpoints of local cells (n,) from those beside them along an axis."""
+        """Return the distances (n,), m, between midpoints of local cells (n,) and their neighbours along an axis."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes (n,), m^d, of local cells, in axisymmetry in the plane; of equal cells one number."""
+        """Return the volumes (n,), m^d, of local cells, in axisymmetry in the plane; one number for equal cells."""
         return self.cell_volume if self.even else self._of_process.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes of local cells (n,) over their longest edges, m^(d-1); of equal cells one number."""
+        """Return volume over longest edge of local cells (n,), m^(d-1); one number for equal cells."""
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of cells by their lexicographic numbers; of equal cells one row, (d,)."""
+        """Return the edges (n, d), m, of cells by lexicographic number; one row (d,) for equal cells."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edges (..., d), m, of the cells at places (..., d), m, from the base; of equal cells (d,)."""
+        """Return the edges (..., d), m, of the cells at positions (..., d), m, from the base; (d,) for equal cells."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return places (..., d), m, from the base, as numbers of cells from the lower corner along each axis."""
+        """Return positions (..., d), m, from the base in units of cells from the lower corner."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -293,15 +293,15 @@ class Grid:
         return out
 
     def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how many cells places (..., d), m, from the base, are apart from others along each axis, >= 0."""
+        """Return distances >= 0 in units of cells, along each axis, between positions (..., d), m, from the base."""
         if self.even:
             return np.abs((y - x) / self._h)
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return places (n, d), m, from the base: by indices of cells, and shares of these from their lower corners.
+        """Return positions (n, d), m, from the base: cell index plus a fraction of the cell from its lower corner.
 
-        index (n, d) may lie beyond the grid: the cells there are as the last ones.
+        Indices (n, d) beyond the grid refer to cells of the size of the last one.
         """
         if self.even:
             return self.low + (index + share) * self._h
@@ -313,7 +313,7 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Return the edges (d,), m, of the cell as UFL: of equal cells a constant."""
+        """Return the edges (d,), m, of the cell as UFL; a constant for equal cells."""
         if self.even:
             return fem.Constant(self.mesh, self._h)
         out = fem.Function(self.cellwise((self.dim,)))
@@ -321,21 +321,21 @@ class Grid:
         return out
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (..., d) along the axes of nodes at places (..., d), m, from the base."""
+        """Return the indices (..., d) along the axes of nodes at positions (..., d), m, from the base."""
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of cells by their indices (n, d) along the axes; of equal cells one row, (d,)."""
+        """Return the edges (n, d), m, of cells by indices (n, d) along the axes; one row (d,) for equal cells."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,), m, beyond coordinates (n,) of cells of many sizes; inf beyond the last one."""
+        """Return the next line (n,), m, above coordinates (n,) in a grid of unequal cells; inf above the last one."""
         return np.append(self.lines[axis], np.inf)[np.searchsorted(self.lines[axis], x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices along an axis of cells of many sizes that hold coordinates, m, clamped into the grid."""
+        """Return the indices of cells at coordinates, m, along an axis of unequal cells, clamped into the grid."""
         return np.clip(np.searchsorted(self.lines[axis], x, side="right") - 1, 0, self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -354,37 +354,37 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells that this process has; shared out evenly where no scene has done so before."""
+        """The cells of this process; distributed evenly if no scene has distributed them before."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Make the mesh, its cells shared out among the processes by what each holds (cells,); once."""
+        """Make the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
         if self._cells is None:
             self._cells = self._made(owners(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return the grid with its cells shared out by what each holds (cells,): this one, or an equal one.
+        """Return a grid with cells distributed by their loads (cells,): this grid, or an equal one with another mesh.
 
         Parameters
         ----------
         load : (cells,)
-            What each cell holds, >= 0.
+            Load of each cell, such as its number of points, >= 0.
         keep
-            Whether a mesh that is there stays, however its cells are shared out: something was made on it.
+            Keep an existing mesh whatever its distribution, because other objects were made on it.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
             self._cells = self._made(owner)
-        elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
+        elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # distributed for an earlier scene
             other = Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
             other._cells = other._made(owner)
             return other
         return self
 
     def _made(self, owner: NDArray[np.int32]) -> Cells:
-        """Return the cells and their mesh, from the ranks of the cells of a copy, an array of the grid's shape."""
+        """Return the cells and their mesh; owner: rank of each cell of one copy, of the grid's shape."""
         own = np.flatnonzero(owner.ravel() == self.comm.rank)
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
         ranks, first = destinations(owner, own)
@@ -394,7 +394,7 @@ class Grid:
         return Cells(self, mesh, np.tile(owner.ravel(), self.copies))
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
+        """Return the lexicographic numbers (n, 2^d) of the nodes of cells."""
         bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
         index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
         return np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(self.shape + 1))
@@ -408,7 +408,7 @@ class Grid:
 
     @property
     def copies(self) -> int:
-        """How often the mesh has the box: once, or for each group of bodies, see `GridOfGroups`."""
+        """Number of copies of the box in the mesh: one, or one for each contact group, see `GridOfGroups`."""
         return 1
 
     @property
@@ -422,75 +422,75 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return the numbers of the first cells of the copies in which material points (n,), by id, are."""
+        """Return the number of the first cell of the copy of each material point (n,), given by id."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
-        """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
+        """Return the space of cellwise constant functions (DG0) of a value shape, made once."""
         return self._of_process.cellwise(shape)
 
     def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
-        """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
+        """Return a new cellwise function for coefficients of forms; all functions of a shape share their memory."""
         return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
     @property
     def given(self) -> dict[str, Any]:
-        """What makes an equal grid: its corners and numbers of cells, or its lines."""
+        """Arguments that make an equal grid: corners and numbers of cells, or lines."""
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape}
         return {"lines": [x + start for x, start in zip(self.lines, self.base, strict=True)]}
 
     @property
     def reach(self) -> float:
-        """Largest coordinate of a place that is kept of bodies on the grid, m."""
+        """Largest coordinate of a position on the grid, relative to the base, m."""
         return float(np.abs([self.low, self.high]).max())
 
     @property
     def has_axis(self) -> bool:
-        """Whether its side "left" is the axis of revolution."""
+        """Whether the side "left" is the axis of revolution."""
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return by what measures in the plane at places (n, d), m, count: 2 pi r (n,), m, in axisymmetry, else 1."""
+        """Return the factor of measures in the plane at positions (n, d), m: 2 pi r (n,), m, in axisymmetry, else 1."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic numbers of cells, in the first copy, from their (n, d) indices along the axes."""
+        """Return the lexicographic numbers of cells, in the first copy, from their indices (n, d) along the axes."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the (n, d) indices of the cells that hold true places (n, d), m, clamped into the grid."""
+        """Return the indices (n, d) of the cells at true positions (n, d), m, clamped into the grid."""
         return self.index_from_base(x - self.base)
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the same of places that count from the base."""
+        """Return the indices (n, d) of the cells at positions (n, d), m, from the base, clamped into the grid."""
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
         return np.clip(i, 0, self.shape - 1, out=i)
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the rank that owns each cell, given by its lexicographic number."""
+        """Return the rank that owns each cell, given by lexicographic number."""
         return self.owners[number]
 
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return this process's index of each cell, -1 where it does not have the cell."""
+        """Return the local index of each cell, given by lexicographic number; -1 for cells of other processes."""
         return self.locals[number]
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes of local nodes (n,), and the copies they belong to (n, d + 1)."""
+        """Return the indices along the axes and the copy (n, d + 1) of local nodes (n,)."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the same of local cells (n,)."""
+        """Return the indices along the axes and the copy (n, d + 1) of local cells (n,)."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
 
     def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local cells (n, d, 2) beside local cells, by axis and end, -1 where this process has none."""
+        """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if this process has none."""
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
@@ -500,8 +500,8 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which places, from the base, lie outside the grid by more than `tolerance` cells, and by rounding."""
-        least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # of those at the sides
+        """Return which positions, from the base, lie outside the grid by more than `tolerance` cells plus rounding."""
+        least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
         for a in range(self.dim):
@@ -514,7 +514,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points.
 
-        mixed (n, 3), m^2: in 3D the means over pieces about these points, by their mean products of offsets.
+        mixed (n, 3), m^2: in 3D, mean products of the offsets in cut subdomains about these points; gradients are then
+        means over the subdomains.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -531,14 +532,14 @@ class Grid:
     def monomials(self) -> NDArray[np.float64]:
         """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one column each.
 
-        Row s is that of the product of the offsets along the axes whose bits are set in s; of cells of many sizes these
-        count in edges of the cell, see `over_edges`.
+        Row s belongs to the product of the offsets along the axes of the bits of s.  For unequal cells the offsets are
+        in units of the edges, see `over_edges`.
         """
         bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Return what `monomials` give (d, 2^d, cells) for offsets in m: of equal cells the same."""
+        """Return coefficients by `monomials` (d, 2^d, cells), converted to offsets in m; unchanged for equal cells."""
         if self.even:
             return coefficients
         bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
@@ -549,7 +550,7 @@ class Grid:
         return reduce(np.multiply, self._hats(cells, x))
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a Q1 field u (nodes, k) at points (n, d), m, in local cells (n,)."""
+        """Return the values of a Q1 field u (nodes, k) at points (n, d), m, in local cells (n,)."""
         out = np.empty((len(x), u.shape[1]))
         for part in in_chunks(len(x)):
             N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]
@@ -557,12 +558,12 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the linear factors (n, 2^d) of the shape functions, one an axis."""
+        """Return the linear factors (n, 2^d) of the shape functions, one for each axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets of this process between two active cells (`cells` = where `active` holds)."""
+        """Return the facets owned by this process between two active cells; cells: the active ones."""
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
         both = self.facet_cells[facets]
@@ -576,16 +577,16 @@ class Grid:
 
 
 class GridOfGroups(Grid):
-    """A grid with a copy of its box for each group of bodies, so that these do not share nodes.
+    """A grid with a copy of its box for each contact group, so that groups share no nodes.
 
-    The mesh is of so many disconnected boxes at one place.  Equal cells of the copies are on one process.
+    The mesh consists of disconnected boxes at the same position.  Equal cells of the copies belong to one process.
 
     Parameters
     ----------
     grid
-        The grid of the bodies.
+        Grid of the bodies.
     group : (points,)
-        Group of each material point of the scene, by id, from 0 on.
+        Group of each material point of the scene, by id, counted from 0.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):
@@ -601,5 +602,5 @@ class GridOfGroups(Grid):
         return self._copies
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers of the first cells of the copies in which material points (n,), by id, are."""
+        """Return the number of the first cell of the copy of each material point (n,), given by id."""
         return self._group[ids] * np.int64(self.cells)

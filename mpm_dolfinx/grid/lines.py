@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lines of a grid whose cells have many sizes: equal ones are found, others are graded away from fine boxes."""
+"""Grid lines for cells of different sizes: equal spacing, and lines graded away from fine boxes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mpm_dolfinx.base.validation import line, numbers
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return by how much coordinates of this size, m, may differ although they should be equal."""
+    """Return the possible rounding error, m, of coordinates of this size."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
 def checked(lines: Sequence[ArrayLike]) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), m, along each of two or three axes; ValueError naming what is not allowed."""
+    """Return the lines (n,), m, along two or three axes; ValueError for invalid ones."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
         raise ValueError(f"grid: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one an axis")
     out = []
@@ -29,14 +29,14 @@ def checked(lines: Sequence[ArrayLike]) -> list[NDArray[np.float64]]:
         if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
             raise ValueError(f"grid: lines along {letter} = {line(places)}, must be {allowed}")
         if np.diff(x).min() <= rounding(x) / SAME:
-            what = f"are {np.diff(x).min():.3g} m apart at the least"
-            raise ValueError(f"grid: lines along {letter}: {what}, must be > {rounding(x) / SAME:.3g} m: of rounding")
+            what = f"smallest spacing {np.diff(x).min():.3g} m"
+            raise ValueError(f"grid: lines along {letter}: {what}, must be > {rounding(x) / SAME:.3g} m for rounding")
         out.append(x)
     return out
 
 
 def equal(x: NDArray[np.float64]) -> bool:
-    """Return whether lines (n,), m, are as far apart from one another as rounding tells."""
+    """Return whether lines (n,), m, are equally spaced within rounding."""
     return bool(np.abs(x - np.linspace(x[0], x[-1], len(x))).max() <= rounding(x))
 
 
@@ -48,22 +48,22 @@ def graded(
     ratio: float = 1.1,
     largest: float = np.inf,
 ) -> list[NDArray[np.float64]]:
-    """Return the lines of a grid whose cells are small in fine boxes and grow away from them.
+    """Return grid lines with small cells in fine boxes that grow away from the boxes.
 
-    Lines go through the whole grid: cells beside a fine box are as narrow as those in it.
+    Lines cross the whole grid, so cells next to a fine box along an axis are as narrow as the cells inside.
 
     Parameters
     ----------
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of the boxes of small cells, at least one, in the grid.
+        Lower and upper corners of the fine boxes, at least one, inside the grid.
     size : number or (d,), m
-        Edges of the small cells, > 0: at most, so that a whole number of them fits a box.
+        Largest edges of the small cells, > 0; a whole number of cells fits each box.
     ratio
-        Of the edges of neighbouring cells, > 1: at most, where there is room for it.
+        Largest ratio of neighbouring edges, > 1, if there is room for it.
     largest : m
-        Edge of the largest cells, >= size.
+        Largest edge of a cell, >= size.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def graded(
     Raises
     ------
     ValueError
-        Boxes that are not in the grid, or numbers out of their range.
+        Boxes outside the grid, or numbers out of range.
     """
     lower = numbers("graded: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
     d = lower.size
@@ -95,7 +95,7 @@ def graded(
 def _along(
     low: float, high: float, fine: NDArray[np.float64], size: float, ratio: float, largest: float
 ) -> NDArray[np.float64]:
-    """Return the lines (n,), m, from low to high; fine (k, 2): intervals of small cells."""
+    """Return the lines (n,), m, from low to high; fine (k, 2): intervals of small cells, m."""
     joined: list[list[float]] = []
     for start, stop in sorted(fine.tolist()):
         if joined and start <= joined[-1][1] + SAME * size:
@@ -122,9 +122,9 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edges (n,), m, that fill a gap, m: each by at most a ratio larger than the one before, the first of size.
+    """Return edges (n,), m, that fill a gap, m, with a common growth factor of at most `ratio`, starting near `size`.
 
-    They grow alike, by what fits the gap; those of the least change are taken.
+    Of the two possible numbers of edges, the one with the factor nearest to one is taken.
     """
     if gap <= 0:
         return np.empty(0)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Which process owns which cells of the grid: recursive coordinate bisection, by what the cells hold.
+"""Partition of the grid's cells among processes: recursive coordinate bisection, weighted by loads.
 
-dolfinx's partitioners share out the cells of the whole background grid, most of which are empty: the body may
-then lie on one process.  Here the box is halved again and again across the longest extent of what it holds, so
-that both halves hold as much; every cut is a plane between cells (Berger and Bokhari 1987).
+dolfinx's partitioners distribute the whole background grid.  Most of its cells are empty, so one process might hold the
+whole body.  Here the box is bisected recursively across the longest extent of its load, into halves of equal load.
+Cuts are planes between cells (Berger and Bokhari 1987).
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 EMPTY = 1e-2
-"""Weight of an empty cell, in average filled cells: what remains of it in memory and time."""
+"""Weight of an empty cell over that of an average filled cell: its remaining share of memory and time."""
 
 
 def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
-    """Return the rank that owns each cell, an array of the grid's shape.
+    """Return the owner rank of each cell, as an array of the grid's shape.
 
     Parameters
     ----------
     load : (cells along each axis)
-        What each cell holds, such as its number of points, >= 0.
+        Load of each cell, such as its number of points, >= 0.
     processes
         Number of ranks, >= 1.
     """
@@ -33,20 +33,20 @@ def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Share out a box of cells among `count` ranks from `first` on; the arrays are views of the whole grid's.
+    """Distribute a box of cells among `count` ranks from `first` on; the arrays are views of the whole grid's arrays.
 
-    Each of them has a cell if there are as many: that comes before equal loads.
+    Each rank has at least one cell if there are enough; this has priority over equal loads.
     """
     out[...] = first
     if count == 1 or weight.size == 1:
         return
     axis = int(np.argmax([_extent(filled, a) if filled.any() else n for a, n in enumerate(weight.shape)]))
     layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    if len(layers) == 1:  # what it holds is one cell
+    if len(layers) == 1:  # the load is in one layer
         axis = int(np.argmax(weight.shape))
         layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
     cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
-    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # for them: half, or what leaves none idle
+    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless some stay idle
     even = (ranks == count // 2) | (ranks != count // 2).all()
     off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
     plane = int(np.argmin(np.where(even, off, np.inf)))
@@ -58,18 +58,20 @@ def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray
 
 
 def _extent(filled: NDArray[np.bool_], axis: int) -> int:
-    """Return over how many layers along an axis filled cells reach."""
+    """Return the number of layers along an axis from the first to the last filled cell."""
     layers = np.flatnonzero(filled.any(axis=tuple(a for a in range(filled.ndim) if a != axis)))
     return int(layers[-1] - layers[0] + 1)
 
 
 def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the ranks that have each of some cells, its owner first, and where each cell's begin: one layer of ghosts.
+    """Return the ranks that hold each of some cells, owner first, and the offsets of each cell's list.
+
+    Neighbours across faces hold a cell as a ghost.
 
     Parameters
     ----------
     owner
-        Rank that owns each cell, of the grid's shape.
+        Owner rank of each cell, of the grid's shape.
     cells : (n,)
         Lexicographic numbers of the cells.
     """

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Files, checkpoints, and what a scene is made of."""
+"""Output files, checkpoints and units."""

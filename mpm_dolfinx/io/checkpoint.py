@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints: a run that was broken off goes on where it was, on any number of processes.
+"""Checkpoints: an interrupted run is resumed from a file, on any number of processes.
 
-A checkpoint is numpy's archive of the state between two steps (`State`), with a description of the scene by which a
-file of another one is refused.
+A checkpoint is a numpy archive of the state between two steps (`State`). A description in it identifies the scene.
 """
 
 from __future__ import annotations
@@ -34,21 +33,21 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step_control import StepControl
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 12  # Source: the format of the files
-FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
-ZIP = b"PK\3\4"  # how numpy's archives begin
-LEAVE = ("pressure", "slope", "bounds")  # of pieces that do not stay
-NODAL = ("velocity", "held", "rest")  # of a State
-NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their kinds
+FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
+ZIP = b"PK\3\4"  # first bytes of a numpy archive
+LEAVE = ("pressure", "slope", "bounds")  # of pieces, not stored when they are cut again
+NODAL = ("velocity", "held", "rest")  # fields of a State
+NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their types
 
 
 @dataclass
 class Checkpoint:
-    """Saves a run now and then, and at its end: the `checkpoint` of `Simulation.run`.
+    """Saves a run at intervals and at its end: the `checkpoint` of `Simulation.run`.
 
     Parameters
     ----------
     file
-        The file, for `resume`; it is replaced by a whole one or not at all.
+        The file, for `resume`. A complete new file replaces the old one.
     every
         Output intervals between two checkpoints, >= 1.
     seconds
@@ -57,9 +56,9 @@ class Checkpoint:
     Raises
     ------
     ValueError
-        An argument that is none of these.
+        An argument out of its range.
     OSError
-        From the run, when the file cannot be written; the one before stays whole.
+        The file cannot be written; raised during the run. The previous checkpoint stays intact.
     """
 
     file: str | os.PathLike
@@ -74,7 +73,7 @@ class Checkpoint:
         numbers("checkpoint: seconds", self.seconds, test=lambda v: v >= 0, allowed=">= 0")
 
     def __call__(self, simulation: Simulation) -> None:
-        """Save the state if it is time."""
+        """Save the state if a checkpoint is due."""
         result, comm = simulation.result, simulation.grid.comm
         due = (len(result.rows) - 1) % self.every == 0
         if due and self.seconds > 0:
@@ -110,25 +109,24 @@ def save(simulation: Simulation, file: Path) -> None:
 
 
 def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
-    """Put a simulation into the state of a checkpoint; return its histories, for `run` to go on with (`after`).
+    """Restore a simulation from a checkpoint; return its result so far, which continues by `run(after=...)`.
 
     Parameters
     ----------
     simulation
-        The scene of the checkpoint, on any number of processes, in the stage of the checkpoint: call its `stage`
-        with what came and went first.  Grid, bodies, materials with their fields and laws, and fluid are compared with
-        the file; loads, boundary conditions, terms and sources may differ.  What observers have gathered for
-        themselves is not in the file.
+        The scene of the checkpoint, on any number of processes. Call its `stage` first, to bring it to the stage of the
+        checkpoint. Grid, bodies, materials with their fields and laws, and fluid must agree with the file. Loads,
+        boundary conditions, terms and sources may differ. Data that observers have gathered are not in the file.
     file
         The checkpoint.
 
     Raises
     ------
     ValueError
-        The file is not a whole checkpoint, or one of another scene: says what differs.  The simulation is then what
-        it was.
+        The file is not a complete checkpoint, or belongs to another scene; the message says why. The simulation is
+        unchanged.
     OSError
-        The file is not there (FileNotFoundError) or cannot be read.
+        The file does not exist (FileNotFoundError) or cannot be read.
     """
     instance("resume: simulation", simulation, Simulation)
     file, comm = path("checkpoint: file", file), simulation.grid.comm
@@ -140,7 +138,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
         found.append(_state(file, arrays, note, simulation))
         return _without_rows(found[0])
 
-    found: list[State] = []  # rank 0 has all rows, and passes them on
+    found: list[State] = []  # rank 0 reads all rows and sends them to their owners
     bare = at_root(comm, read)
     state = found[0] if found else bare
     nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
@@ -154,7 +152,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return the arrays of a state by names with slashes."""
+    """Return the arrays of a state by name, with slashes for nested dictionaries."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -172,7 +170,7 @@ def _arrays(state: State) -> dict[str, NDArray]:
 
 
 def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation) -> State:
-    """Return the state in a file, all of it; ValueError where it is none of the simulation's."""
+    """Return the complete state in a file; ValueError if it does not fit the simulation."""
     now, dim = simulation.state, simulation.grid.dim
     wet, damaged = simulation.scene.fluid is not None, f"{file}: is cut short or damaged"
     ids, total = simulation.scene.all_ids(now.stage.present), sum(map(len, simulation.bodies))
@@ -192,7 +190,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             leaves = dict.fromkeys(LEAVE) if stay is not None and stay.keeps is None else {}
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
-                raise ValueError("pieces: of_cell, start: of another stay")
+                raise ValueError("pieces: of_cell, start: do not fit the kept cut")
         histories = _part(arrays, "result/")
         times = histories["t"]
         outcomes = _outcomes(_part(histories, "outcome/"), len(times))
@@ -203,7 +201,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
         if arrays or not all(np.isfinite([note["t"], *times])):
-            raise ValueError(f"has {', '.join(arrays) or 'other times'}")
+            raise ValueError(f"has {', '.join(arrays) or 'times that are not finite'}")
         return State(
             t=note["t"],
             points=points,
@@ -222,7 +220,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
 
 
 def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str, NDArray]]]:
-    """Return what conditions had done at each of so many output times."""
+    """Return the outcomes of the conditions at each of `count` output times."""
     out: list[dict[str, dict[str, NDArray]]] = [{} for _ in range(count)]
     for quantity, names in _nested(arrays).items():
         for name, found in names.items():
@@ -232,9 +230,9 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return an outcome of the conditions that there are now; of those that there were not, as it is.
+    """Return a stored outcome, reduced to the present conditions; a condition that is new keeps its present outcome.
 
-    ValueError where it has other shapes, or how far tools have been pushed is not finite.
+    Raises ValueError for other shapes, and for a non-finite displacement or velocity of a tool.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
     if "energy" in outcome:
@@ -242,7 +240,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
     for quantity, of in found.items():
         for name, value in of.items():
             if quantity == "energy" and (value.shape or not np.isfinite(value)):
-                raise ValueError(f"outcome/{quantity}/{name} is no finite number")
+                raise ValueError(f"outcome/{quantity}/{name} is not a finite number")
             if quantity == "energy":
                 continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
@@ -253,7 +251,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return arrays by names with slashes in dictionaries of dictionaries."""
+    """Return arrays whose names contain slashes as nested dictionaries."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -265,9 +263,9 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64], total: int) -> MaterialPoints:
-    """Return points of these ids from arrays as those of others; ValueError where they are not.
+    """Return points with these ids from stored arrays; ValueError if they do not match `like`.
 
-    Renewed points take the place of some; their numbers are beyond the total of the bodies'.
+    Renewed points replace some seeded points; their ids are at least `total`, the number of seeded points.
     """
     data = _part(arrays, "data/")
     if PARENT in data:
@@ -280,18 +278,18 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
         if rows.dtype != kind.dtype or rows.shape != (len(ids), *kind.shape[1:]) or not np.isfinite(rows).all():
             raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
     if set(data) != set(like.data) or not np.array_equal(points.id, ids):
-        raise ValueError("points/id: other points than the bodies'")
+        raise ValueError("points/id: points differ from those of the bodies")
     return points
 
 
 def _nodes(grid: Grid) -> NDArray[np.int64]:
-    """Return the lexicographic numbers of the nodes of this process."""
+    """Return the lexicographic numbers of this process's nodes."""
     *index, copy = grid.node_places(np.arange(len(grid.node_x))).T
     return np.ravel_multi_index(tuple(index), tuple(grid.shape + 1)) + copy * grid.nodes
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return numbers and values of the nodes that have any, of all processes, on rank 0; of none without."""
+    """Return numbers and values of the nodes with non-zero values, of all processes, on rank 0; empty for None."""
     if nodal is None:
         return {}
     nodal = nodal.reshape(-1, grid.dim)
@@ -303,7 +301,7 @@ def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> d
 
 
 def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.float64] | None:
-    """Return the values of this process's nodes from those of all that have any; None without."""
+    """Return this process's nodal values from the stored nodes with non-zero values; None for None."""
     if given is None:
         return None
     node, values = given["node"], np.concatenate([given["values"], np.zeros((1, grid.dim))])
@@ -314,25 +312,25 @@ def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.floa
 
 
 def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Refuse, with a ValueError, arrays that are no values of nodes of a grid."""
+    """Raise ValueError for arrays that are not nodal values on the grid."""
     node, values = arrays.pop("node"), arrays.pop("values")
     right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
     if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
-        raise ValueError(f"{name}: none of nodes of the grid, or not finite")
+        raise ValueError(f"{name}: not nodal values on the grid, or not finite")
     if len(node) and not 0 <= node[0] <= node[-1] < grid.copies * grid.nodes:
-        raise ValueError(f"{name}: of other nodes than the grid's")
+        raise ValueError(f"{name}: node numbers out of range of the grid")
     arrays |= {"node": node, "values": values}
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
-    """Refuse, with a ValueError, arrays that are none of the pieces of points of these ids."""
+    """Raise ValueError for arrays that do not belong to pieces of points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
         if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
             raise ValueError(f"pieces: {name}: {rows.dtype} of shape {rows.shape}, or not finite")
     if not np.array_equal(np.unique(arrays["id"]), ids) or (np.diff(arrays["id"]) < 0).any():
-        raise ValueError("pieces: id: other points than the bodies'")
+        raise ValueError("pieces: id: points differ from those of the bodies")
 
 
 def _without_rows(state: State) -> State:
@@ -346,7 +344,7 @@ def _without_rows(state: State) -> State:
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return arrays in dictionaries of dictionaries by names with slashes."""
+    """Return the arrays of nested dictionaries by names with slashes."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -354,7 +352,7 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
 
 
 def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    """Take out the arrays whose names begin with a prefix."""
+    """Remove the arrays whose names begin with a prefix, and return them without it."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
@@ -366,7 +364,7 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
     try:
         with np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except Exception as error:  # numpy and zipfile have many for bytes that are not what they expect
+    except Exception as error:  # damaged bytes raise many types of errors in numpy and zipfile
         raise ValueError(f"{file}: {what}") from error
     if str(arrays.pop("format", None)) != FORMAT or "note" not in arrays:
         raise ValueError(f"{file}: {FOREIGN}")
@@ -383,14 +381,14 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 
 def describe(simulation: Simulation) -> dict[str, Any]:
-    """Return the constants that make the scene, by name, as a checkpoint holds them."""
+    """Return the constants that define the scene, by name, as a checkpoint stores them."""
     kept = sorted(simulation.state.stage.kept(0))
     more = {"bodies present": list(simulation.present), "data that points keep of conditions": kept}
     return {**simulation.scene.description, **more}
 
 
 def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
-    """Refuse the checkpoint of another scene."""
+    """Raise ValueError for the checkpoint of another scene."""
     for name in {**there, **here}:
         if there.get(name) != here.get(name):
             both = f"{there.get(name)} there, {here.get(name)} here, must agree"

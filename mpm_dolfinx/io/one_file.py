@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""All output times of the points of a run in one file of ParaView's: XDMF, with its numbers in HDF5."""
+"""All output times of the material points of a run in one XDMF file for ParaView, with its data in HDF5."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ from mpm_dolfinx.io.writer import Series
 
 
 def one_file(folder: str | os.PathLike) -> Path:
-    """Write the points that a `Writer` has written to a folder as one time series, `points.xdmf` and `points.h5`.
+    """Write the points that a `Writer` has written to a folder as one time series: `points.xdmf` and `points.h5`.
 
-    ParaView and VTK read it, and meshio's `xdmf.TimeSeriesReader`; dolfinx reads the domains of one output time as a
-    mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")`, of the third.  Each output time has its own
-    domains, so bodies may be dug away and filled in between.  `<Information>` in points.xdmf says what the fields are,
-    and their units.  The files of the `Writer` stay: of a run that goes on, what is there by now is written, and all
-    when this is called again at its end.
+    ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read it. dolfinx reads the particle domains of one output time as
+    a mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third. Each output time has its own
+    domains, so bodies may be excavated and placed in between. `<Information>` in points.xdmf describes the fields and
+    their units. The files of the `Writer` are kept. During a run it writes the output times so far; call it again at
+    the end.
 
     Parameters
     ----------
     folder
-        That of the `Writer`; the two files come into it when they are whole.
+        Folder of the `Writer`. The two files appear in it when they are complete.
 
     Returns
     -------
     Path
-        That of points.xdmf.
+        Path of points.xdmf.
 
     Raises
     ------
     ValueError
-        A folder without points of a `Writer`, or no h5py that can be loaded beside dolfinx.
+        The folder has no points of a `Writer`, or no h5py that is compatible with dolfinx is installed.
     OSError
-        A folder that cannot be written, a disk that is full.
+        The folder is not writable, or the disk is full.
     """
     folder = path("one_file: folder", folder)
     if not (folder / "points.pvd").exists():
-        raise ValueError(f"one_file: folder = {folder}: has no points.pvd, must be that of a Writer")
+        raise ValueError(f"one_file: folder = {folder}: has no points.pvd, must be the folder of a Writer")
     try:
         import h5py
-    except Exception as error:  # that of PyPI brings an HDF5 of its own, which fails beside dolfinx's in many ways
+    except Exception as error:  # PyPI's h5py has its own HDF5, which conflicts with dolfinx's in many ways
         which = "Debian's (apt install python3-h5py) or, with conda's dolfinx, conda-forge's"
         raise ValueError(f"one_file: h5py: {line_of(error)}; must be {which}") from error
     entries = Series(MPI.COMM_SELF, folder / "points.pvd", np.inf).entries
-    with TemporaryDirectory(dir=folder) as part:  # beside the old ones, which stay until the new ones are whole
+    with TemporaryDirectory(dir=folder) as part:  # the old files stay until the new ones are complete
         writer = TimeSeriesWriter(Path(part) / "points.xdmf")
-        writer.h5_filename = "points.h5"  # meshio's own comes into the present folder
+        writer.h5_filename = "points.h5"  # meshio's default is in the working directory
         with h5py.File(Path(part) / "points.h5", "w") as writer.h5_file:
             for name, meaning in FIELDS["points.pvd: the domains of the material points"].items():
                 SubElement(writer.domain, "Information", Name=name, Value=meaning)
@@ -69,7 +69,7 @@ def one_file(folder: str | os.PathLike) -> Path:
 
 
 def _add(writer: TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
-    """Add a mesh of its own and its fields; meshio's `write_data` knows but one mesh for all times."""
+    """Add a mesh and its fields; meshio's `write_data` supports only one mesh for all times."""
     grid = SubElement(writer.collection, "Grid", Name=str(number), GridType="Uniform")
     SubElement(grid, "Time", Value=repr(t))
     writer.points(grid, mesh.points)

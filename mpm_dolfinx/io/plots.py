@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of a scene: the domains of its points, coloured by what they carry."""
+"""Pictures of a scene: the particle domains, coloured by a field."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from mpm_dolfinx.simulation.simulation import Simulation
 
 
 def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
-    """Draw the domains of the material points, coloured by a field; return the axes of matplotlib.
+    """Draw the particle domains, coloured by a field, and return the axes of matplotlib.
 
-    On several processes all call it together; the first one draws, the others have None.
+    The call is collective: the first process draws, the others return None.
 
     Parameters
     ----------
     simulation
         The scene, in plane strain or axisymmetry.
     field
-        "pressure", "displacement" (its length), "displacement_x", "stress_xx", "effective_stress_xy",
-        "mean_effective_stress", "deviatoric_stress", "porosity", "J", and other names of numbers in `points.pvd` and
+        "pressure", "displacement" (its magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
+        "mean_effective_stress", "deviatoric_stress", "porosity", "J", and any other scalar in `points.pvd` and
         `points.data`.
     ax
-        Axes to draw into; by default those of a new figure.
+        Axes to draw into; by default new ones.
     bar
         Draw a colour bar with the unit.
     label
-        Its label; by default the name of the field and its unit.
+        Label of the colour bar; by default the name of the field and its unit.
     **style
-        Of matplotlib's PolyCollection, such as cmap and clim.
+        Arguments of matplotlib's PolyCollection, such as cmap and clim.
 
     Raises
     ------
     ValueError
-        A scene in 3D, or a field that the points do not have; the message names those that they have.
+        A scene in 3D, or an unknown field; the message lists the fields of the points.
     ImportError
         matplotlib is not installed.
     """
@@ -73,10 +73,10 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
 
 
 def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
-    """Return the values (n,) of a field at this process's points."""
+    """Return the values (n,) of a field at the points of this process."""
     points, asked = simulation.points, {}
     if str(field).startswith(("porosity", "effective_", "stress", "mean_", "deviatoric_")):
-        asked = asked_of_points(simulation)  # on all processes together
+        asked = asked_of_points(simulation)  # collective
     known: dict[str, Callable[[], Any]] = {
         "displacement": lambda: np.linalg.norm(points.displacement, axis=1),
         "displacement_x": lambda: points.displacement[:, 0],

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Files of a run: material points and grid for ParaView, histories as a table.
 
-Every output is a file of its own, and the index that names the files is replaced only by a whole one:
-whenever a run ends, what it has written until then can be read.
+Every output is a separate file. A new index of these files replaces the old one only when it is complete. All output
+written before the end of a run can therefore be read, however the run ends.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-"""VTK's cell for a domain, and the domain's corners in VTK's order."""
-WRITABLE = "in a folder that can be written, with room; the run goes on with `after=simulation.result`"
+"""VTK's cell type of a particle domain, and the domain's corners in VTK's order."""
+WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
 COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
 
 
@@ -47,26 +47,26 @@ class Writer:
 
     The folder receives
 
-    * `points.pvd`, the points' domains as solid cells with displacement, pore pressure, F, J, what else the points
-      carry, and what `Simulation.point_fields` gives: stresses, p', q, porosity;
-    * `history.csv`, one row an output time with the counts of `Result` so far, least and largest pressure, what is
-      recorded of the probes, the forces of the given displacements and of tools, and the outflow through open sides
-      (nan where no step has been taken since they were set by a stage);
-    * `fields.txt`, which says what each of these is, and its unit;
-    * with tools `tools.pvd`, what they fill of the grid's cells, with their forces;
-    * if asked for `grid.pvd`, what the cells hold (`Simulation.cells`), by components, zero in empty cells.
+    * `points.pvd`: the particle domains as solid cells. Their fields are displacement, pore pressure, F, J, all data of
+      the points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
+    * `history.csv`: one row for each output time, with counts of `Result`, least and largest pressure, records of
+      probes, forces of prescribed displacements and tools, and outflows. The last two are nan until a stage's first
+      step;
+    * `fields.txt`: meaning and unit of each of these fields;
+    * with tools, `tools.pvd`: the parts of the grid's cells inside the tools, with the forces of the tools;
+    * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`), by components, zero in empty cells.
 
-    ParaView and VTK read all of it, meshio the points.
+    ParaView and VTK read all files, meshio reads the points.
 
-    What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
-    the files of a run that was never interrupted.
+    Output up to the present time stays in the folder and is continued. A writer made after `resume` therefore leaves
+    the same files as a run without interruption.
 
-    A writer locks its folder against other processes until `close`, the end of its context, or its own end.
+    A writer locks its folder against other processes until `close`, the end of its context, or its deletion.
 
     Parameters
     ----------
     simulation
-        The scene, in the state from which it is going to run.
+        The scene, in the state from which the run starts.
     folder
         Folder of the files.
     every
@@ -77,10 +77,10 @@ class Writer:
     Raises
     ------
     ValueError
-        An argument of another kind, files in the folder that no writer has written or of other columns, a run of
-        another simulation or one that does not go on from where the writer was made, a writer that is closed.
+        An argument of the wrong type; files in the folder that no writer has written, or with other columns; a run of
+        another simulation, or one that starts at another time; a closed writer.
     OSError
-        A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
+        The folder is not writable, or the disk is full. `simulation.run(..., after=simulation.result)` continues.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
@@ -94,7 +94,7 @@ class Writer:
         """Whether the writer has released its folder."""
         tools = simulation.state.stage.of(Tool)
         own = tuple(f"{quantity.removesuffix('s')}_" for quantity in simulation.state.outcome)
-        with on_disk("writer: folder", "one that can be written"):
+        with on_disk("writer: folder", "writable"):
             self._lock: Lock | None = None
             at_root(comm, lambda: self._hold(folder))
             self._table = Table(comm, folder / "history.csv", self._t, own)
@@ -112,14 +112,14 @@ class Writer:
         self.close()
 
     def close(self) -> None:
-        """Release the folder to other processes; all that was written is whole.  A second call does nothing."""
+        """Release the folder to other processes. All files are complete. A second call does nothing."""
         self._lock, self.closed = None, True
 
     def _hold(self, folder: Path) -> None:
         self._lock = Lock.of(folder)
 
     def __call__(self, simulation: Simulation) -> None:
-        """Write a row of the histories and, in its turn, the present state."""
+        """Write a row of the histories and, every `every` intervals, the present state."""
         if self.closed:
             raise ValueError(f"writer: {self._points.file.parent} is closed, must be open while the run goes on")
         if simulation is not self._simulation:
@@ -140,9 +140,9 @@ class Writer:
         self._write_indices()
 
     def _start(self, result: Result) -> None:
-        """Drop what the folder holds of later times: from here on the files are this run's."""
+        """Drop the output of later times from the folder: a new run continues it from here."""
         if (began := result.rows[-2][0]) != self._t:
-            raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
+            raise ValueError(f"writer: made at t = {self._t:g} s for a run that starts at t = {began:g} s")
         self._table.start(_row(Result(result.rows[-2:-1])))
         self._write_indices()
 
@@ -172,17 +172,17 @@ class Writer:
         comm, stem = simulation.grid.comm, self._grid.next
         with _true_places(simulation.grid):
             _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
-        if comm.rank == 0:  # our index names the pieces themselves: 0.5's own names each of them once a function
+        if comm.rank == 0:  # our index names the files of the processes; dolfinx 0.5 repeats them for each function
             stem.with_suffix(".pvd").unlink(missing_ok=True)
             stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
         pieces = [stem.with_name(f"{stem.name}_p{rank}_000000.vtu") for rank in range(comm.size)]
-        if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
+        if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not report a full disk
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
         self._grid.entries.append((simulation.t, pieces))
 
 
 def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
-    """Return porosity, stresses by components, and their invariants (n,) at this process's points, by name."""
+    """Return porosity, stresses by components, and their invariants (n,) at the points of this process, by name."""
     asked, wet = simulation.point_fields(), simulation.scene.fluid is not None
     out = {"porosity": asked.porosity}
     for name in ("effective_stress", "stress")[: 1 + wet]:
@@ -192,7 +192,7 @@ def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write what tools fill of the grid's cells, with their numbers and forces."""
+    """Write the parts of the grid's cells inside the tools, with number and force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
     corners = [tool.drawn(grid, simulation.t, simulation.tool_travel[name]) for name, tool in tools.items()]
     forces = np.stack([simulation.tool_forces[name][: grid.dim] for name in tools])
@@ -202,7 +202,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """A folder that this process alone writes into, for as long as any of its writers holds the lock."""
+    """An exclusive lock of a folder; it ends with the last writer of this process that holds it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
@@ -217,7 +217,7 @@ class Lock:
 
     @classmethod
     def of(cls, folder: Path) -> Lock:
-        """Return the lock of a folder, which is made if it is not there; ValueError where another process has it."""
+        """Return the lock of a folder, which is created if necessary; ValueError if another process holds it."""
         folder.mkdir(parents=True, exist_ok=True)
         folder = folder.resolve()
         lock = cls._held.get(folder)
@@ -227,14 +227,14 @@ class Lock:
 
 
 def _row(result: Result) -> dict[str, float]:
-    """Return what the histories hold of the last output time, and what acts at the conditions then."""
+    """Return the histories at the last output time, and the outcomes of the conditions at that time."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
     return out | {name: float(value) for name, (value, _) in columns(row, row.outcome).items()}
 
 
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
-    """Return the domains of points as cells of their own, with all that the points carry.
+    """Return the particle domains as unconnected cells, with all fields of the points.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
     displacement : (n, d), m
         Their displacements.
     wet
-        Whether the points' pore pressure has a meaning.
+        Whether the pore pressure of the points is defined.
     """
     fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
     if wet:
@@ -252,7 +252,7 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
 
 
 def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.Mesh:
-    """Return cells of corners (n, 2^d, d), m, each with nodes of its own, and their fields (n, ...)."""
+    """Return unconnected cells with corners (n, 2^d, d), m, and their fields (n, ...)."""
     kind, order = VTK_CELLS[corners.shape[2]]
     data = {label: [column] for name, rows in fields.items() for label, column in _columns(name, rows)}
     nodes = corners[:, order].reshape(-1, corners.shape[2])
@@ -260,13 +260,13 @@ def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.M
 
 
 def _padded(vectors: NDArray) -> NDArray:
-    """Return vectors (n, d) with three components, as VTK wants them."""
+    """Return vectors (n, d) with three components, as VTK requires."""
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
 
 
 def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
     """Yield the fields by which VTK shows scalars, vectors or tensors (n, ...)."""
-    if rows.shape[1:] == (2, 2):  # not as 3 x 3: what is out of the plane is not known
+    if rows.shape[1:] == (2, 2):  # not as 3 x 3: the out-of-plane components are unknown
         for i, j in np.ndindex(2, 2):
             yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
     elif rows.shape[1:] == (2,):
@@ -276,7 +276,7 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
-    """Return copies, by their names in the file, of the step's displacement and of what the cells hold."""
+    """Return the displacement increment of the step and the fields of the cells as functions, named as in the file."""
     scene, d = simulation.scene, simulation.grid.dim
     cells, u = simulation.cells(), scene.momentum.u
     moved = fem.Function(u.function_space, name="step_displacement")
@@ -291,7 +291,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
         for name in ("effective_stress", "stress")[: 1 if cells.pressure is None else 2]:
             fields[f"{name}_{'xyz'[i]}{'xyz'[j]}"] = getattr(cells, name)[:, i, j]
     out = [moved]
-    for name, rows in fields.items():  # of numbers only: 0.5 takes vectors for nodal ones
+    for name, rows in fields.items():  # scalars only: dolfinx 0.5 writes vectors as nodal fields
         out.append(fem.Function(simulation.grid.cellwise(), name=name))
         out[-1].x.array[cells.cell] = rows
         out[-1].x.scatter_forward()
@@ -300,7 +300,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 
 @contextmanager
 def _true_places(grid: Grid) -> Iterator[None]:
-    """Give the mesh of a grid the true places of its nodes, for as long as it is written."""
+    """Shift the mesh of a grid to the true positions of its nodes while it is written."""
     x = grid.mesh.geometry.x
     own = x.copy()
     x[:, : grid.dim] += grid.base
@@ -311,12 +311,12 @@ def _true_places(grid: Grid) -> Iterator[None]:
 
 
 def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t: float) -> None:
-    with io.VTKFile(comm, str(file), "w") as f:  # writes its index once more when it goes out of scope
+    with io.VTKFile(comm, str(file), "w") as f:  # writes its index again when it is closed
         f.write_function(fields, t)
 
 
 def _ends(file: Path) -> bool:
-    """Whether a file of VTK is there up to its end."""
+    """Return whether a VTK file exists and is complete."""
     if not file.exists():
         return False
     with open(file, "rb") as f:
@@ -326,7 +326,7 @@ def _ends(file: Path) -> bool:
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """Give the path of a file to write, which takes the place of `file` when it is whole and on the disk."""
+    """Give a temporary path for writing; the complete file then replaces `file`, once it is on the disk."""
     part = file.with_name(file.name + ".part")
     yield part
     with open(part, "rb") as f:
@@ -336,7 +336,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Refuse a file that no `Writer` has written, with a ValueError."""
+    """Raise ValueError for a file that no `Writer` has written."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
@@ -344,13 +344,13 @@ def _ours(file: Path) -> Iterator[None]:
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
-    """Return what a run that goes on from time t leaves of earlier (time, ...): nothing if it is a new one."""
+    """Return the earlier entries (time, ...) that a run from time t keeps: none if it is a new run."""
     out = [entry for entry in entries if entry[0] <= t]
     return out if any(entry[0] < t for entry in out) else []
 
 
 class Series:
-    """A time series for ParaView: an index (.pvd) and the files it names, in a folder beside it.
+    """A time series for ParaView: an index (.pvd) and its files, in a folder of the same name.
 
     entries: (time, its files) so far, the same on every process; next: path of the next file, without suffix.
     """
@@ -375,7 +375,7 @@ class Series:
         return list(times.items())
 
     def write_index(self) -> None:
-        """Write the index of the files so far."""
+        """Write the index of all files so far."""
         root = ElementTree.Element("VTKFile", type="Collection", version="1.0")
         collection = ElementTree.SubElement(root, "Collection")
         for t, files in self.entries:
@@ -393,7 +393,7 @@ class Series:
 class Table:
     """A table in a CSV file, to which rows are added one by one; the first column is the time.
 
-    Columns whose names begin with one of `own` are those of conditions, which come and go with stages.
+    Columns whose names begin with one of `own` belong to conditions: they may change from stage to stage.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
@@ -402,18 +402,18 @@ class Table:
         self._own = own
         self._rows = at_root(comm, lambda: kept(self._read(), t))
         self.columns: list[str] = []
-        """Names of the columns, once it has been started."""
+        """Names of the columns, after `start`."""
 
     def _read(self) -> list[tuple[float, dict[str, str]]]:
         if not self.file.exists():
             return []
         with _ours(self.file):
             text = self.file.read_text()
-            whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may have been broken off
+            whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may be incomplete
             return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
-        """Write the rows that were kept, or else a first row."""
+        """Write the kept rows, or a first row if there are none."""
         rows = [row for _, row in self._rows] or [first]
         self.columns = list(rows[0])
         self._check(first)
@@ -425,7 +425,7 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row; one of new columns begins the file anew with these, nan in the rows so far."""
+        """Add a row. New columns rewrite the file, with nan in all earlier rows."""
         self._check(row)
         new = [name for name in row if name not in self.columns]
         self.columns.extend(new)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Balance of momentum, and loads and supports that act on it."""
+"""Balance of momentum: stresses, inertia, loads and supports."""

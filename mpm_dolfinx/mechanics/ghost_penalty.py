@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Ghost penalty: nearly empty cells deform as the fuller ones beside them (Burman 2010, Coombs 2023).
+"""Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
-gamma s 2G h/3 int [d_n u].[d_n v] dS on the step's increment: cells that are hardly filled then spoil neither the
-conditioning nor the answer.  It acts like a viscosity of the step where it acts on what carries the body, so it is
-kept from there:
+The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment of the step. Nearly empty cells then
+affect neither the conditioning nor the accuracy. The penalty is a viscosity of the step, so it must not act on
+load-bearing cells:
 
-* The strength s of a face falls from 1 to 0 as the emptier cell's share of the fuller one's filling rises to RATIO, and
-  with the square of the fuller one's share of the fullest cell's beside the emptier: it leads from full cells to empty
-  ones, whose free nodes follow at next to no work.  Faces between alike cells would resist kinks of the body itself.
-* Its scale is the shear modulus.  With lambda + 2G nearly empty cells of nearly incompressible bodies would have to
-  stretch as the cell beside them does, whatever their own volume asks for; so they would, in soil that flows, with 2G.
+* The strength s of a face falls from 1 to 0 as the filling of the emptier over the fuller cell rises to RATIO. A second
+  factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell). Empty cells thus
+  follow full ones at almost no work. A penalty between equally filled cells would resist kinks of the body itself.
+* The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
+  stretch of the full neighbour, against their own volume constraint. In flowing soil even 2G does: see `stiffness`.
 
-Bodies that are integrated at their points have cells with too few points for their nodes anywhere: there all faces of
-cells that are not full carry a fifth of the penalty.
+With integration at the points, any cell may hold too few points for its nodes. There all faces of cells that are not
+full carry a fifth of the penalty.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 GHOST = 0.05
 """Strength gamma of the ghost penalty.  Plateau (beam): halved 9.9e-06, doubled 1.9e-05, cells 1.5e-02."""
 YIELDING = 0.02
-"""Least share of it for nearly incompressible laws with a state."""
+"""Least factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""A cell filled less than this share of a neighbour is nearly empty: faces between the two carry the penalty.
+"""A cell with a smaller filling, relative to a neighbour, is nearly empty: the face between them is penalised.
 
 Plateau (soil): halved 1.3e-03, doubled 5.9e-04, cells 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Strength where bodies are integrated at their points, and filling below which cells carry it."""
+"""Strength for integration at the points; filling below which the faces of a cell then carry the penalty."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
-    """Return the modulus that scales the penalty, Pa: 2G, less of nearly incompressible laws with a state.
+    """Return the modulus that scales the penalty, Pa: 2G, reduced for nearly incompressible laws with a state.
 
-    Nearly empty cells of soil that flows keep a volume of their own, at odds with the penalty: with 2G the limit load
-    of a footing rises by 0.3 (nu = 0.49) and 0.75 % (0.499) as the penalty does tenfold, by 0.004 % at nu = 0.3.
-    There it stays as it is: without it Newton's method fails in frictional soil that is pushed deep.
+    In nearly empty cells of flowing soil the volume constraint opposes the penalty. With 2G, a tenfold penalty raises a
+    footing's limit load by 0.3 % (nu = 0.49) and 0.75 % (0.499), by 0.004 % at nu = 0.3. At low nu it is not reduced:
+    without it Newton's method fails in frictional soil at deep penetration.
     """
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
 
 
 def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
-    """Return the form int strength h^power [d_n u].[d_n v] dS over faces, h the mean edge of the cells across, m."""
+    """Return the form int strength h^power [d_n u].[d_n v] dS over faces; h: mean cell size across them, m."""
     n = ufl.FacetNormal(grid.mesh)("+")
     *_, across = across_faces(grid, n)
     dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
@@ -64,7 +64,7 @@ def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power:
 
 
 class GhostPenalty:
-    """The form, with modulus and filled share of the cells.
+    """The penalty's form, with modulus and volume fraction of the cells as coefficients.
 
     Parameters
     ----------
@@ -78,13 +78,13 @@ class GhostPenalty:
     Attributes
     ----------
     modulus
-        Scale of the penalty by what the cells hold, Pa, see `stiffness`.
+        Mean over the material in the cell of the penalty's modulus, Pa, see `stiffness`.
     shear
-        Mean over what the cells hold of the shear modulus of laws with a history, Pa, 0 of others.
+        Mean over the material in the cell of the shear modulus, Pa, of laws with a state; zero for other laws.
     firmness
-        Form of the elastic shear stiffness over whole cells, times their filled share: what makes tangents firmer.
+        Form of the elastic shear stiffness over whole cells, times their volume fraction: regularises tangents.
     fill, beside
-        Filled share of each cell, and of the fullest of its neighbours.
+        Volume fraction of each cell, and the largest one among its neighbours.
     """
 
     def __init__(self, grid: Grid, V: fem.FunctionSpace, at_points: bool):
@@ -101,44 +101,50 @@ class GhostPenalty:
         self.firmness = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
-        """Return the strength of a face times its modulus, the harmonic mean of both cells', Pa, as UFL."""
+        """Return the strength of a face times the harmonic mean of both cells' moduli, Pa, as UFL."""
         fills, moduli, beside = ([f("+"), f("-")] for f in (self.fill, self.modulus, self.beside))
         full, little = ufl.max_value(*fills), ufl.min_value(*fills)
-        fullest = ufl.conditional(ufl.lt(*fills), *beside)  # beside the emptier one
+        fullest = ufl.conditional(ufl.lt(*fills), *beside)  # largest filling next to the emptier cell
         strength = ufl.max_value(0.0, 1 - little / (RATIO * full)) * (full / fullest) ** 2
         if self._at_points:
             strength = SPARSE
         return strength * 2 * moduli[0] * moduli[1] / (moduli[0] + moduli[1])
 
-    def set_contents(self, volume: NDArray[np.float64], *moduli: NDArray[np.float64]) -> None:
-        """Set volumes (cells,), m^d, of what the owned cells hold, and `modulus` and `shear`, Pa, times volume."""
+    def set_contents(
+        self, own: NDArray[np.int64], volume: NDArray[np.float64], *moduli: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Set the contents of the owned cells (n,) that are not empty; return all active local cells, ascending.
+
+        Volumes (n,), m^d; moduli (n,): `modulus` and `shear`, Pa, times volume. `fill` must be zero before.
+        """
         grid, fill = self.grid, self.fill.x.array
-        fill[:] = volume / grid.volumes(np.arange(grid.num_local))
+        fill[own] = volume / grid.volumes(own)
         for f, total in zip((self.modulus, self.shear), moduli, strict=True):
-            f.x.array[:] = np.divide(total, volume, out=np.zeros_like(total), where=volume > 0)
+            f.x.array[own] = total / volume
         for f in (self.fill, self.modulus):
             f.x.scatter_forward()
-        own = np.arange(grid.num_owned)
-        neighbours = grid.facet_cells[grid.cell_facets[own]].sum(axis=2) - own[:, None]  # -1 where there is none
+        ghosts = grid.num_owned + np.flatnonzero(fill[grid.num_owned :])
+        neighbours = grid.facet_cells[grid.cell_facets[own]].sum(axis=2) - own[:, None]  # -1 at the grid's boundary
         self.beside.x.array[own] = np.where(neighbours >= 0, fill[neighbours], 0.0).max(axis=1, initial=0.0)
         self.beside.x.scatter_forward()
+        return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
-        """Return the penalty on faces of this process, and on those of them in cells that walls hold nodes of."""
+        """Return the penalty on faces of this process; at_walls: faces of cells with nodes on fixed walls."""
         return GhostLoads(self.form.on(facets), self.form.on(at_walls))
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return those of the inner faces that carry the penalty."""
+        """Return the inner faces that carry the penalty."""
         fill = self.fill.x.array[self.grid.facet_cells[facets]]
         return facets[fill.min(axis=1) < (FULL if self._at_points else RATIO * fill.max(axis=1))]
 
 
 class GhostLoads(Loads):
-    """The ghost penalty on faces of a cut, on all and on those at walls."""
+    """The ghost penalty on all faces of a cut, and on its faces at walls of the grid."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add its matrix."""
+        """Add the matrix of the penalty."""
         (self._at_walls if walls else self._everywhere).assemble_matrix(A)

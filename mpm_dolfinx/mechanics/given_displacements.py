@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Given displacements of sides: penalties on means in the cells and at points across the side, see `held_cells`."""
+"""Prescribed displacements of sides: penalties on the mean in each cell, and weakly at points; see `held_cells`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from mpm_dolfinx.points.parts import Parts
 
 
 class HoldForms:
-    """Points, or means over points, with a given displacement along a direction; what holds it, and pulls to it."""
+    """Penalty forms: stiffness, and force towards the prescribed value, at points or for means over points."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -43,11 +43,11 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the mean of a Q1 field, along the direction, by the moments of the places it is over."""
+            """Return the mean of a Q1 field along the direction, from the moments of its points."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
-            if d == 3:  # of third derivatives of a trilinear function one is not zero
+            if d == 3:  # a trilinear function has one third derivative that is not zero
                 mean += ufl.grad(second)[:, 0, 1, 2] * h.product
             return ufl.dot(mean, h.direction)
 
@@ -56,17 +56,17 @@ class HoldForms:
 
 
 class GivenDisplacements(Acting):
-    """The given displacements of a stage.
+    """The prescribed displacements of a stage.
 
     Parameters
     ----------
     setting, displacements
-        Where they are put, and the displacements by name.
+        The stage, and its conditions by name.
 
     Raises
     ------
     ValueError
-        Two give the same component on the same part of a face.
+        Two conditions prescribe the same component on the same part of a face.
     """
 
     conditions, title = (Displacement,), "given displacements"
@@ -77,7 +77,7 @@ class GivenDisplacements(Acting):
         self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
-        self._warned: set[int] = set()  # numbers of the conditions, of which nothing but the log knows
+        self._warned: set[int] = set()  # numbers of the conditions, for the log only
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
@@ -86,19 +86,19 @@ class GivenDisplacements(Acting):
                 self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
         self._holds = self.held = held_faces(setting)
         for hold in displacements.values():
-            if not callable(hold.value):  # what a function gives is checked when it is called
+            if not callable(hold.value):  # values of functions are checked when they are called
                 hold.at(0.0, np.empty((1, d)))
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces that are held."""
+        """Faces with prescribed displacements."""
         return [faces for _, faces, _ in self._holds]
 
     def placed(self, place: Place) -> Loads:
-        """Return what holds them, a row a component, by cells and points."""
+        """Return the penalties of a substep, one row for each component and each cell or point."""
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
-        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # without: held where they count from
+        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty: zero displacement
         held = HeldCells(self._grid, self._held_points(place.cut, place.points, place.t, ends, place.inertia))
         placed, message = [], ""
         for axis in range(d):
@@ -108,7 +108,7 @@ class GivenDisplacements(Acting):
             if wrong >= 0:
                 hold, x = self._holds[held.number[wrong]][0], held.x[wrong] + self._grid.base
                 what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
-                message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
+                message = f"{what}, where a wall of the grid fixes it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
@@ -128,19 +128,19 @@ class GivenDisplacements(Acting):
     def _held_points(
         self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
     ) -> HeldPoints:
-        """Return the points of integration on held sides, at the owners of their cells.
+        """Return the integration points on the sides, at the owners of their cells.
 
-        ends: start and end of the step, s; none for sides at rest; inertia: whether velocities count.
+        ends: start and end of the step, s, empty for sides at rest; inertia: whether velocities count.
         """
         d, rows = self._grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self._holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
-        cut_points = cut.points if ends else points  # which are where they were cut
+        cut_points = cut.points if ends else points  # in the positions of the cut
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
         modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
         firm = self._materials.confined_modulus(before)
-        # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
+        # from the last reset of the grid, like the stiffnesses: constant while the cut is valid
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
@@ -148,7 +148,7 @@ class GivenDisplacements(Acting):
             if inertia and ends and t < ends[1]:
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
-            R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
+            R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
@@ -158,23 +158,23 @@ class GivenDisplacements(Acting):
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
     def _check_meeting(self, t: float) -> None:
-        """Refuse given displacements that differ where they meet: no body's stress is finite there."""
+        """Refuse prescribed displacements that differ where two sides meet: the stress there would be infinite."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
             if jump.max(initial=0.0) > NEAR * self._grid.least:
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
-                raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
+                raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or be two cells apart")
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, that a side is given at places X (m, d) of this process."""
+        """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
         return everywhere(self._grid, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return reactions of this value."""
+        """Return reactions with all components equal to `value`."""
         return {"reactions": {name: np.full(self._grid.dim, value) for name in self._names}}
 
     def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
-        """Return the forces (d,), N, by which each of them acts on the bodies at u."""
+        """Return the force (d,), N, of each condition on the bodies at u."""
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
@@ -186,15 +186,15 @@ class GivenDisplacements(Acting):
     def _warn(
         self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
     ) -> None:
-        """Warn, once a condition, of forces that no change of the body's stress balances."""
+        """Warn, once for each condition, of forces that no stress increment of the body can balance."""
         for number, x in held.beyond(row, axis, force, self._warned):
-            why = "its reaction is an artefact; does something else hold it, or is the step too large?"
-            what = "%s: not where it is to be at %s: %s"
+            why = "its reaction is an artefact; is it also held by another condition, or is the step too large?"
+            what = "%s: not at its prescribed position at %s: %s"
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), x + self._grid.base, why)
             self._warned.add(number)
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse a step in which the gap to a given displacement grows by most of the way, wherever it moves."""
+        """Refuse a step in which no point of a side follows more than half of its prescribed increment."""
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
@@ -203,22 +203,22 @@ class GivenDisplacements(Acting):
             moves = way > NEAR * self._grid.least
             came = 1 - ((new - old)[moves] / way[moves]).min(initial=np.inf)
             came = over_all(self._grid.comm, float(came), MPI.MAX)
-            if -np.inf < came < 0.5:  # nearer to none of the way than to all of it
-                what = f"{line(hold)}: the bodies come {max(0.0, came):.0%} of the way that is given at most"
-                raise NotConverged(f"{what}, must have room there: pores that are sealed keep their water")
+            if -np.inf < came < 0.5:  # less than half of the increment
+                what = f"{line(hold)}: the bodies follow at most {max(0.0, came):.0%} of the prescribed increment"
+                raise NotConverged(f"{what}, must be free to move: undrained pores keep their water")
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of domains: prisms of their volume (m,) under faces that are held.
+        """Return new corners (m, 2^d, d), m, of particle domains: prisms of volume (m,) behind their prescribed faces.
 
-        In axisymmetry the volume is the area in the plane.
-        A held face stays where its tracked corners are: put elsewhere it would be pulled back, all at once.
+        In axisymmetry the volume is the area in the plane. The face keeps its tracked corners: the penalty would pull a
+        displaced face back at once.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
             held = np.flatnonzero(np.isin(ids, faces.id))
-            number = faces.face[np.searchsorted(faces.id, ids[held])]  # of a domain with two held faces the first
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # the first of two prescribed faces
             axis, end = (k[:, None] for k in np.divmod(number, 2))
             outward = face_vectors(tracked[held], number)
             depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
@@ -229,22 +229,22 @@ class GivenDisplacements(Acting):
 
 
 class HoldLoads(Loads):
-    """Given displacements in a substep.
+    """Prescribed displacements in a substep.
 
     Parameters
     ----------
     acting
         The conditions.
     forms, data
-        Components that are given, with stiffness, direction and gap.
+        Forms, and the prescribed components with stiffness, direction and gap.
     held
-        What holds them.
+        Geometry and stiffness of all rows.
     row : (m,)
-        Which of it each component is.
+        Row in `held` of each component.
     share : (m, 2^d)
-        Of its force on each node, but for what walls bear.
+        Fraction of its force on each node, without the part that grid boundary conditions bear.
     place
-        Where and when they were placed.
+        Time and cut of the substep.
     """
 
     stiff = True
@@ -271,41 +271,41 @@ class HoldLoads(Loads):
         self.under_held = acting.under_held
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the forces towards the given displacements."""
+        """Add the forces towards the prescribed displacements."""
         self._forms.pull.assemble_vector(b, self.data)
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the stiffness that holds them; what they count at walls is in `counted`."""
+        """Add the penalty stiffness; `counted` has the forces on nodes at grid boundary conditions."""
         if not walls:
             self._forms.hold.assemble_matrix(A, self.data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return given displacements that are off their place by so much more."""
+        """Return the same conditions with gaps reduced by a displacement u."""
         data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
         return HoldLoads(self._acting, self._forms, data, self.held, self.row, self.share, self._place)
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
+        """Return the displacement (m,), m, along each prescribed component, at nodal values u (nodes, d), m."""
         at_nodes = u[self.data.points.grid.cell_nodes[self.data.cells]]
         return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.data["direction"])
 
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
+        """Return the force (m,), N, along each prescribed component, at nodal values u (nodes, d), m."""
         return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
-        """Return the power, W, of what pulls the sides along."""
+        """Return the power, W, of the penalty forces."""
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""
+        """Return degrees of freedom (n,), and the reactions' forces (n,), N, on them."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )
         return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return u with the rigid motions of the parts that given displacements turn; None where they turn none."""
+        """Return u with rigid motions of the parts that the conditions rotate; None if they rotate none."""
         grid = self.data.points.grid
         if grid.axisymmetric:
             return None
@@ -318,23 +318,23 @@ class HoldLoads(Loads):
         return moved
 
     def touching(self) -> tuple:
-        """Return cells, places and directions of what is held."""
+        """Return cells, positions and directions of the prescribed components."""
         return self.data.cells, None, self.data.x, self.data["direction"]
 
     @property
     def held_cells(self) -> NDArray[np.int32]:
-        """The cells of sides that are held."""
+        """Cells with prescribed components."""
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what rounding leaves: that of rigid sides with coordinates as well."""
+        """Return the rounding error of nodal forces, with the penalty's: stiffness times that of coordinates."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])
         return of_cells + 4 * EPSILON * grid.reach * held
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse a step in which the bodies have not come along."""
+        """Refuse a step in which the bodies did not follow the sides."""
         self._acting.check_came(self._place, points, before)
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -343,7 +343,7 @@ class HoldLoads(Loads):
 
 
 def held_faces(setting: Setting) -> list[tuple[Displacement, Surface, Sequence[int]]]:
-    """Return the given displacements of a stage with the faces at which they are imposed, and the axes along which."""
+    """Return the conditions of a stage with the faces and the axes on which they are imposed."""
     holds = [(hold, hold.axes(setting.grid.dim)) for hold in setting.of(Displacement).values()]
     others = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
     return [(hold, setting.sides.held(hold, rest), axes) for (hold, axes), rest in zip(holds, others, strict=True)]

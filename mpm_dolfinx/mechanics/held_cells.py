@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Given displacements of sides in the cells: their means are held firmly, what is left of them weakly.
+"""Prescribed displacements of sides in the cells: a stiff penalty on the mean, a weak one on the deviation from it.
 
-A Q1 field cannot follow a side at more places than it has nodes for: held firmly at each of them, sides that are curved
-or lie aslant to the grid would lock.  The weak part leaves no wave to itself that the means do not see.  It carries
-the stress that the body has there, turned as the side is, so what holds takes the step's change of stress only, and
-gives way by so much less.
+A Q1 field has too few nodes in a cell to follow a side at many points. A stiff penalty at each of them would lock sides
+that are curved or inclined to the grid. The weak penalty controls the modes with zero mean in each cell. The present
+traction of the body, rotated with the side, is applied explicitly. Both penalties then carry the traction increment of
+the step only, and their gap is smaller by that factor.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Slope of a side in a cell to an axis below which its cells can follow it, whatever they keep their volume."""
+"""Largest slope of a side to a grid axis at which the cells can follow every point, even at constant volume."""
 EVERYWHERE = 1e2
-"""Stiffness of what holds each point of such a side across it, in units of (what resists) / (cell size).
+"""Normal penalty stiffness at each point of such a side, in units of (resisting modulus) / (cell size).
 
 Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02.
 """
 TENSE = 10
-"""Share of the stress of a side that adds to its modulus: held with less than its stress it buckles.
+"""Factor of the stress at a side in the penalty's modulus: a side held less stiffly than its stress buckles.
 
 Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02.
 """
-CARRIED = 0.3  # change of traction in a step, in units of what resists and stress: no body's stress changes so much
+CARRIED = 0.3  # traction increment of a step over resisting modulus and stress: larger ones are not physical
 
 
 class HeldPoints(NamedTuple):
-    """Points of integration on sides with given displacements; arrays over n points in owned cells.
+    """Integration points on sides with prescribed displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance,
-    firm : (n,) modulus to hold with, norm of the stress when the grid was reset, what resists, and what resists where
-    nothing can give way, times area, N; x, gap : (n, d) position, and how far it is from where it is to be, m; given :
-    (n, 2 d) given displacements at the start and the end of the step, m; normal : (n, d) area vector when the grid was
-    reset, m^(d-1); force : (n, d) of the body's present stress, as the side turns it, N.
+    number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x, gap : (n, d) position, and
+    prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
+    modulus, tension, resistance, firm : (n,) penalty modulus, norm of the stress at the last reset of the grid,
+    resisting modulus, and confined modulus, each times area, N.
+    normal : (n, d) area vector at the last reset, m^(d-1); force : (n, d) present force, rotated with the side, N.
     """
 
     number: NDArray[np.int64]
@@ -60,23 +60,23 @@ class HeldPoints(NamedTuple):
 
 
 class HeldCells:
-    """What holds given displacements: rows of means, one a condition and cell, and after these one a point.
+    """Penalty rows of prescribed displacements: means, one for each condition and cell, then points.
 
     Parameters
     ----------
     grid
         Background grid.
     points
-        The points of integration.
+        The integration points.
 
     Attributes
     ----------
     number, cell, x, shape, moments
-        Of each row: condition, cell, mean position (m), mean shape functions, means of products of
-        the components of the offset from the cell's midpoint.
+        Of each row: condition, cell, mean position (m), mean shape functions, mean products of the offsets from the
+        cell's midpoint.
     stiffness, limit
-        By component, N/m: across a flat side along the grid that of what cannot give way; and force beyond which it is
-        an artefact, N, for means.
+        By component: penalty stiffness, N/m, normal to a side along the grid with the confined modulus; and for means
+        the largest plausible force, N. Larger forces are artefacts.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):
@@ -117,7 +117,7 @@ class HeldCells:
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
         self.stiffness = both(HOLD / h[0] * modulus, each / h[1])
-        # at the end of a side a node's force may come by a small part of a cell
+        # at the end of a side, a small part of a cell may carry the whole force of a node
         short = np.maximum(1.0, grid.smallest_faces(cell) * grid.around(x) / whole)
         self.limit = CARRIED * total(p.resistance + TENSE * p.tension) * short
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
@@ -126,33 +126,33 @@ class HeldCells:
         self._x = both(x, x[at])
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
-        """Return which rows give a component, their gaps (k,), m, with what their force makes of them; what is refused.
+        """Return the rows that prescribe a component, with stiffness, gap and nodal fractions.
 
-        Where a wall that the side runs into holds nodes of the cell, these are asked for nothing: else its other nodes
-        would make up for them, and others for these, to and fro along the side.  A side that is to move at the wall,
-        by more than half of its motion beside it, bends over this cell; then its other nodes are held by it only where
-        no other cell holds them.  It does all through a step if it is off its place at the start or the end of it.
+        A row leaves out nodes that a wall fixes, if the side runs into the wall. Otherwise the free nodes of the cell
+        would compensate for the fixed ones, with an oscillation along the side. Some sides move at such a wall by more
+        than half of their displacement in the cell, at the start or the end of the step. The displacement then bends
+        over this cell. The row is dropped if other rows already hold all of its free nodes.
 
         Parameters
         ----------
         axis
             The component.
         given : (conditions,)
-            Which conditions give it.
+            Conditions that prescribe it.
         free : (nodes,)
-            Which nodes no wall holds.
+            Nodes that no wall fixes in this component.
 
         Returns
         -------
-        Rows (k,), their stiffnesses (k,) and gaps (k,), and the shares (k, 2^d) of their forces that they have on each
-        node, but for what the wall bears; of a row that walls hold and that has to move, its index or -1.
+        Rows (k,), stiffness (k,), N/m, gaps (k,), m, and fractions (k, 2^d) of the forces on the nodes, without the
+        part of the wall; index of a row that must move but whose nodes are all fixed, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
         walled = ~free[nodes]
         held = ((N * ~walled).sum(axis=1) < NEAR) & (np.abs(gap) > NEAR * grid.least)
         stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
-        moved, rise = (v[chosen][..., axis :: grid.dim, None] for v in (self._given, self._rise))  # at both ends
+        moved, rise = (v[chosen][..., axis :: grid.dim, None] for v in (self._given, self._rise))  # at both times
         torn = np.zeros(len(chosen), dtype=bool)
         for b in range(grid.dim):
             for sign in (-1, 1):
@@ -171,10 +171,9 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which rows (k,) have nodes of a wall, `stuck` (k, 2^d), and others that all have rows without such.
+        """Return the rows (k,) with nodes at a wall whose other nodes all have rows without such nodes.
 
-        number, nodes, N : (k,), (k, 2^d) twice
-            Conditions, nodes, and shape functions.
+        number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): nodes at the wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)
@@ -191,18 +190,18 @@ class HeldCells:
     def beyond(
         self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the conditions, but those told of, whose force is beyond its limit, and where (d,), m, it is most.
+        """Return the conditions whose force exceeds its limit, with the position (d,), m, of the largest excess.
 
-        A Q1 field that cannot have the means of two cells at once is pulled to and fro between them, as where a side
-        lies along a grid line.  The body feels their sum at the nodes, and so does the reaction: a row is beyond its
-        limit where what its condition does to its nodes is, besides its own force.
+        A Q1 field cannot always meet the means of two neighbouring cells, as for a side along a grid line. The
+        penalties then push it to and fro. Only their sum at the nodes acts on the body and counts in the reaction. A
+        row therefore exceeds its limit only if both its own force and the condition's nodal forces do.
 
         Parameters
         ----------
         row, axis, force : (k,)
-            Rows, their components, and their forces, N.
+            Rows, components, and forces, N.
         told
-            Numbers of conditions.
+            Numbers of conditions that have been reported already, which are left out.
         """
         grid = self.grid
         comm = self.grid.comm

@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Inertia: consistent mass, velocities of points and nodes, and the accelerations of the substeps.
+"""Inertia: consistent mass, velocities of points and nodes, and accelerations in the substeps.
 
-A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2: u^ is the displacement of free flight,
+A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. The displacement u^ of free flight is
 
-    u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a),
+    u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-g and b the shares of its own rate and of that of the substep before (`time_integration`).  Only velocities are carried
-from step to step.  SDIRK2 loses GAMMA^4 (omega dt)^4, 0.74 % of (omega dt)^4, of the energy of an oscillation in a
-step, and damps modes that the step cannot resolve.
+The weights g and b belong to the substep's own rate and to that of the previous substep (`time_integration`). Only
+velocities are carried from step to step. In each step SDIRK2 dissipates GAMMA^4 (omega dt)^4, 0.74 % of (omega dt)^4,
+of an oscillation's energy. It damps modes that the step cannot resolve.
 
-The mass is that of the pieces of the domains, with their second moments S about their centroids x_k,
+The mass is integrated over the pieces of the particle domains, with second moments S about their centroids x_k,
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full.  G is zero for affine fields, on which M
-and the right side agree: linear and angular momentum survive the way to the grid and back to rounding.  Points carry v
-and the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain.  Its increments come from the grid
-(Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is the
-midpoint rule of a shorter step, in which a chord stands for the arc of a turn: see `chord`.
+with the ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full. G vanishes for affine
+fields, for which M and the right side agree. The transfer to the grid and back therefore conserves linear and angular
+momentum to rounding. Points carry v and the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain. Its
+increments come from the grid (Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992). The
+first substep of SDIRK2 is a midpoint rule: `chord` corrects its rotations.
 """
 
 from __future__ import annotations
@@ -46,36 +46,36 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass: a turning block keeps its momentum and energy alike with a tenth and ten times of it.
+"""Strength c of the ghost mass. A tenth and ten times of it change neither momentum nor energy of a turning block.
 
-That is a test of `tests/test_inertia.py`.
+`tests/test_inertia.py` tests this.
 """
 RELAXES = 2.0
-"""Rate, per cell that a corner has moved, at which velocities of points relax to those of the grid.
+"""Rate, per cell of corner motion, at which point velocities relax to grid velocities.
 
-It removes what points have and nodes do not see.  A bar of 20 cells that vibrates and flies over 50, 40 steps a period,
-has errors of its velocity of 1.7, 1.2, 1.2 and 1.2 % after 25 periods with 0, 0.1, 2 and 10, and loses 1.58, 1.60, 1.60
-and 1.67 % of its energy.
+It removes velocity modes of the points that the nodes cannot represent. In a test, a bar of 20 cells vibrates and flies
+over 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates of 0,
+0.1, 2 and 10. The energy loss is 1.58, 1.60, 1.60 and 1.67 %.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"
-"""Names of what points carry: velocity (n, d), m/s, at the centroid, and rate of F (n, d, d), 1/s."""
+"""Names of point data: velocity (n, d), m/s, at the centroid, and rate of F (n, d, d), 1/s."""
 
 
 def resting(points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return what points carry that are at rest."""
+    """Return velocity and rate of F of points at rest."""
     return moving(points, np.zeros(points.x.shape[1]), 0.0)
 
 
 def checked_velocity(
     grid: Grid, quadrature: str, inertia: bool | None, velocity: ArrayLike | Callable | None
 ) -> ArrayLike | Callable | None:
-    """Return the velocity at the start of bodies that may have inertia, zero where none is given; None of others.
+    """Return the initial velocity of a scene with the argument `inertia`, zero by default; None if `inertia` is None.
 
     Raises
     ------
     ValueError
-        A velocity without inertia, or inertia where there can be none.
+        A velocity without inertia, or inertia with a scene that does not support it.
     """
     if inertia is None:
         if velocity is not None:
@@ -99,21 +99,21 @@ def moving(
     base: NDArray[np.float64],
     rings: bool = False,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return what points carry that move as given: `VELOCITY` and `RATE`.
+    """Return the point data `VELOCITY` and `RATE` of a given velocity field.
 
     Parameters
     ----------
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Velocity, or a function of places, of which domains take the nearest affine field.
+        Velocity, or a function of position; particle domains take the affine field nearest to its corner values.
     base : (d,), m
-        Place from which those of the points count.
+        Origin of the points' coordinates.
     rings
-        Whether domains are rings, whose centroids are those of their volumes.
+        Whether the domains are rings of an axisymmetric scene, with centroids of volumes.
 
     Raises
     ------
     ValueError
-        It has another shape, or is not finite.
+        The velocity has another shape, or is not finite.
     """
     n, corners, d = points.corners.shape
     places = (points.corners + base).reshape(-1, d)
@@ -134,7 +134,7 @@ def moving(
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d): in the plane in a tenth of the time of numpy's."""
+    """Return the inverses of matrices (n, d, d); 2 x 2 ones take a tenth of numpy's time."""
     if A.shape[1] > 2:
         return np.linalg.inv(A)
     (a, b), (c, e) = A.transpose(1, 2, 0)
@@ -143,13 +143,14 @@ def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the increment less one that laws see in a midpoint rule, and the turn of their stress, both (n, d, d).
+    """Return the effective increment F~ - 1 of laws in a midpoint rule, and the rotation of their stress.
 
-    With C = F^T F at both ends of the rule, F_n and F_n + 2 D, its mean is F^T F + D^T D for F = F_n + D.  Laws see
+    The rule takes F from F_n to F_n + 2 D, with its midpoint F = F_n + D. The mean of C = F^T F at both ends is F^T F +
+    D^T D. Laws are evaluated at
 
-        F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~):
+        F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
-    a rigid turn then stretches nothing, however stiff the body, and P F^T is symmetric, so moments balance.
+    A rigid rotation then causes no strain, however stiff the body is. P F^T is symmetric, so moments balance.
 
     Parameters
     ----------
@@ -163,16 +164,16 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class InertiaForms:
-    """The compiled forms of inertia, and what those of stresses and fluxes see of it.
+    """The compiled forms of inertia, and their coefficients in the forms of stresses and fluxes.
 
     Parameters
     ----------
     points
-        All points of integration.
+        All integration points.
     of_laws
-        Those of each law.
+        The integration points of each law.
     u
-        Increment of the displacement in the step, m.
+        Displacement increment of the step, m.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -182,7 +183,7 @@ class InertiaForms:
         self.acceleration = self._rate * (u - self._flight)
         """Acceleration at u as UFL, m/s^2."""
         self._midpoint = fem.Constant(grid.mesh, 0.0)
-        for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # no ring turns rigidly
+        for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # rings never rotate
             chords: Latest[tuple[NDArray, NDArray]] = Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
             seen.follow("turn", (d, d), partial(self._seen, chords, 1))
@@ -194,26 +195,26 @@ class InertiaForms:
         self.moving = p = FormPoints(grid, velocity=(d,), turn=(d, d))
         self._momentum = PointForm((ufl.inner(p.velocity, p.value(v)) + ufl.inner(p.turn, p.plane_grad(v))) * p.dx, p)
         self.density = fem.Function(grid.cellwise())
-        """Density (cells,) of what the cells hold, kg/m^3."""
+        """Density (cells,) of the material in the cells, kg/m^3."""
         self.work = fem.Function(V)
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the acceleration that forms see, none of bodies at rest; midpoint: whether the substep is such a rule."""
+        """Set the acceleration in the forms, zero without inertia; midpoint: whether the substep is a midpoint rule."""
         self._midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the accelerations (n, d), m/s^2, at u in cells, by values (n, 2^d) of the shape functions there."""
+        """Return the accelerations (n, d), m/s^2, at u in cells, from values (n, 2^d) of the shape functions."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return gradients that laws see, or turns of their stress (n, d^2): see `chord`.
+        """Return effective gradients for the laws, or rotations of their stress, (n, d^2): see `chord`.
 
-        chords: the last ones, that all forms at the same u share.
+        chords: the last result, which all forms at the same u share; which: 0 for gradients, 1 for rotations.
         """
         G, d = data.gradients(self._u), self.grid.dim
         if self._midpoint.value:
@@ -229,20 +230,20 @@ class InertiaForms:
         unknowns: Unknowns,
         held: Unknowns,
     ) -> Mass:
-        """Return the mass of bodies on the grid.
+        """Return the mass of the bodies on the grid.
 
         Parameters
         ----------
         cut
-            The domains of the points, cut.
+            The cut particle domains.
         mass : (n,), kg
-            Of the points.
+            Masses of the points.
         fill : (cells,)
-            Filled shares of the local cells.
+            Volume fraction of the local cells.
         facets
-            Faces between two active cells one of which is not full.
+            Faces between two active cells, at least one not full.
         unknowns, held
-            Of the displacement, and what walls hold.
+            Unknown displacements, and displacements that grid boundary conditions fix.
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
@@ -264,20 +265,20 @@ class InertiaForms:
 
 
 class Mass:
-    """The mass of the bodies on the grid, while a cut serves.
+    """The mass of the bodies on the grid, while a cut is valid.
 
     Parameters
     ----------
     forms
         Compiled forms.
     cut
-        The domains of the points, cut.
+        The cut particle domains.
     pieces
         Their pieces, with masses, kg, as weights.
     unknowns
-        Of the displacement.
+        Unknown displacements.
     M, held
-        Masses, kg, of the unknowns, and of what walls hold beside them.
+        Mass matrices, kg, of the unknowns, and with rows for the displacements that grid boundary conditions fix.
     """
 
     def __init__(
@@ -297,7 +298,7 @@ class Mass:
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
-        """Return the velocities of the unknowns, m/s: the projection of those of the points."""
+        """Return the velocities of the unknowns, m/s: the projection of the point velocities."""
         cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
         L = velocity_gradients(points)
         v = points.data[VELOCITY][cut.pieces.point] + np.einsum("nij,nj->ni", L[cut.pieces.point], self._off)
@@ -313,16 +314,16 @@ class Mass:
     def carried(
         self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], moved: NDArray[np.float64]
     ) -> dict[str, NDArray[np.float64]]:
-        """Return velocities and rates of F that points have after a step.
+        """Return velocities and rates of F of the points after a step.
 
         Parameters
         ----------
         points
-            At the start of the step.
+            Points at the start of the step.
         velocities
-            Of the unknowns, at its start and end, m/s.
+            Velocities of the unknowns at the start and the end of the step, m/s.
         moved : (n,)
-            Cells by which corners have moved at most where the grid is reset, else 0.
+            Largest motion of a corner in cells if the grid is reset, else 0.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -334,7 +335,7 @@ class Mass:
         return out
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
-        """Return a vector of the unknowns as a local array, ghosts included, zero where walls hold."""
+        """Return a vector of the unknowns as a local array with ghosts, and with zeros at fixed displacements."""
         work = self._forms.work
         work.x.array[:] = 0.0
         self.unknowns.add(work, 1.0, v)
@@ -342,7 +343,7 @@ class Mass:
 
     @cached_property
     def _off(self) -> NDArray[np.float64]:
-        """Ways (m, d), m, from the centroids of the domains to those of their pieces."""
+        """Vectors (m, d), m, from the centroids of the particle domains to the centroids of their pieces."""
         pieces = self._cut.pieces
         return pieces.x - self._cut.mean(pieces.x)[pieces.point]
 
@@ -352,7 +353,7 @@ class Mass:
         return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return the affine field over each domain that is nearest to nodal velocities: `VELOCITY` and `RATE`."""
+        """Return `VELOCITY` and `RATE` of the affine field over each domain that is nearest to nodal velocities v."""
         cut, grid, d, nodal = self._cut, self._forms.grid, self._forms.grid.dim, self.local(v)
         at, slope = grid.at(cut.cells, cut.x, nodal.reshape(-1, d)), self._pieces.gradients_of(nodal)
         at, slope = (cut.to_pieces(values) for values in (at, slope.reshape(-1, d, d)))
@@ -362,7 +363,7 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry in the plane."""
+    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry without the circumferential one."""
     d = points.x.shape[1]
     return points.data[RATE] @ inverses(points.F[:, :d, :d])
 
@@ -373,11 +374,11 @@ class Inertia(Loads):
     Parameters
     ----------
     mass
-        Of the bodies on the grid.
+        Mass of the bodies on the grid.
     flight
         Displacement of free flight, m.
     rate
-        (Own share of the step)^-2, 1/s^2.
+        (Weight of the substep's own rate, s)^-2, 1/s^2.
     """
 
     holding = True
@@ -398,16 +399,16 @@ class Inertia(Loads):
         return u
 
     def inertia(self, at: At) -> PETSc.Vec:
-        """Return the forces that accelerate the bodies at u, N."""
+        """Return the inertia forces at u, N."""
         return self._mass.M * self.acceleration(at)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Add what accelerates nodes beside walls to what these bear."""
+        """Add the inertia of the unknowns to the forces on fixed nodes."""
         if on is not self._mass.unknowns:
             residual += self._mass.held * self.acceleration(at)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return zeros where the mass has entries."""
+        """Return a zero matrix with the sparsity of the mass."""
         zeros = self._mass.M.copy()
         zeros.zeroEntries()
         return zeros
@@ -419,26 +420,26 @@ class Inertia(Loads):
         return slope
 
     def coupling(self, at: At) -> PETSc.Mat:
-        """Return the derivative of the forces by u."""
+        """Return the derivative of the inertia forces with respect to u."""
         return self._slope
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns, m/s, at the start of a step and after a substep, and its acceleration, m/s^2."""
+    """Velocities of the unknowns, m/s, at the start of a step and after a substep; its acceleration, m/s^2."""
 
     start: PETSc.Vec
     velocity: PETSc.Vec
     acceleration: PETSc.Vec | None = None
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the displacement of free flight at the end of the next substep, m; own, before: its shares, s."""
+        """Return the displacement of free flight at the end of the next substep, m; own, before: its weights, s."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)
         return flight
 
     def after(self, acceleration: PETSc.Vec, own: float, before: float) -> Flight:
-        """Return what is known after the next substep."""
+        """Return the velocities and the acceleration after the next substep."""
         velocity = self.start + acceleration * own
         if self.acceleration is not None:
             velocity += self.acceleration * before

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""Mean dilatation: one volume change per cell, the cure for volumetric locking of nearly incompressible skeletons.
+"""F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
-Four constraints of volume a cell leave a Q1 quadrilateral no freedom to bend: with nu = 0.499 it is up to half
-too stiff.  Here the law sees the deformation gradient with the volume ratio of the step averaged over the cell,
+Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral: with nu = 0.499 it is up to half too
+stiff. F-bar evaluates the law at a deformation gradient whose volume ratio of the step is the cell's mean theta,
 
-    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
+    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-along all three axes: in plane strain points carry the stretch across the plane, as in a slice of the body.  Which do
-is a matter of their material (`Skeleton.nearly_incompressible`).  In a cell that these share with others the others
-see their own F: one constraint a cell is left, and neither kind of material knows of the other but by the
-displacements that they share.  The energy sum w psi(Fbar) / J_n has the derivative
+The scaling acts along all three axes: in plane strain the points carry an out-of-plane stretch, as in a slice of the
+body. The material decides whether it locks (`Skeleton.nearly_incompressible`). In a cell of several materials the other
+materials take their own F. The energy sum w psi(Fbar) / J_n has the derivative
 
-    sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w),
+    sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-so for given (theta, pi) the residual is that of one more term in the energy, and the tangent is symmetric:
-what theta and pi contribute has rank two in each cell (Simo, Taylor and Pister 1985; F-bar of the material point
-method by increments: Coombs et al. 2018).  A law that gives its stress has P(Fbar) : dFbar in place of dPsi.  The
-points keep Fbar; the J_n with which the next step begins is that of the cell's domains (`cell_ratios`).
+For given (theta, pi) the residual has one more term of the energy, and the tangent is symmetric. The contribution of
+theta and pi has rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material point method:
+Coombs et al. 2018). A law without an energy has P(Fbar) : dFbar in place of dPsi. The points keep Fbar. The next step
+starts from a J_n that follows from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -42,14 +41,14 @@ from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
 class MeanDilatation:
-    """The cells' volume ratio theta of the step and the mean stress pi that goes with it.
+    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi.
 
     Parameters
     ----------
     grid
         Background grid.
     numbers
-        Which parts of the pieces lock, see `QuadratureData`, in the order in which they are added.
+        Indices of the parts that lock, see `QuadratureData`, in the order of the calls of `add`.
     symmetric
         Whether the tangents of all laws are symmetric.
     """
@@ -66,12 +65,12 @@ class MeanDilatation:
         self._stresses: list[StressAtPoints] = []
 
     def seen(self, points: FormPoints, F):
-        """Return Fbar (3, 3), what laws see of F, a UFL variable; (2, 2) where they are for the plane only."""
+        """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that are defined in the plane only."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
         if self._grid.stretches == 2 and ACROSS not in points.functions:
             return ufl.variable(ufl.sqrt(ratio) * F)
         ratio = ratio ** (1 / 3)
-        if self._grid.stretches == 2:  # of F scaled to its determinant, see `in_space`
+        if self._grid.stretches == 2:  # F is scaled to its determinant, see `in_space`
             across = getattr(points, ACROSS)
             return ufl.variable(embedded(ratio / ufl.sqrt(across) * F, ratio * across))
         return ufl.variable(block(ratio * F) if self._grid.axisymmetric else ratio * F)
@@ -97,18 +96,18 @@ class MeanDilatation:
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
-            What the law sees of it, see `seen`.
+            Its F-bar modification, see `seen`.
         ratio
             det Delta, of F over that at the start of the step.
         values
             UFL values of the law's parameters, state and local unknowns.
         known
-            The same for what is not differentiated, see `LocalUnknowns`.
+            The same values for expressions that are not differentiated, see `LocalUnknowns`.
 
         Returns
         -------
         The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative by F (d, d, d,
-        d), Pa, for the tangent; and what the tangent is to sum over the pieces of each cell, for `assemble_matrix`.
+        d), Pa, for the tangent; and further sums of the tangent in each cell, for `assemble_matrix`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         self._ratios.append(CellSums([ratio], points))
@@ -121,7 +120,7 @@ class MeanDilatation:
         return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""
+        """Return the derivatives of psi(Fbar) by F and by theta; for a law without an energy, of its work."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -130,13 +129,14 @@ class MeanDilatation:
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives by F and by theta of both that `_stress` gives.
+        """Return the derivatives by F and by theta of both results of `_stress`.
 
-        In the plane a law without energy is itself derived by Fbar only, in half of the time: with Fbar = s F
+        In the plane a law without an energy is differentiated by Fbar only, which takes half of the time. With Fbar = s
+        F
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        of F (d, d) and the part of s F that is in its axes.  In 3D that would take two minutes to compile.
+        for F (d, d) and the part of s F in its axes. In 3D this would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self._grid.dim == 3:
@@ -152,7 +152,7 @@ class MeanDilatation:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return the derivative by F of a part of tau, of which C has the derivative by Fbar."""
+            """Return the derivative by F of a component of tau, from its derivative C by Fbar."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n
@@ -164,20 +164,20 @@ class MeanDilatation:
         return P_F, _dev(tau_theta, F) * G, mean_F / theta, (mean_theta - slope) / theta
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
-        """Set theta, the stresses of the pieces, and pi at the present displacement; solve: for unknowns of laws."""
+        """Set theta, the stresses and pi at the present displacement; solve: solves for the laws' local unknowns."""
         self._set_mean(self.theta, self._ratios, data)
         solve()
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f to the means of a quantity over the pieces that lock, of which there are sums (cells, 1)."""
+        """Set f to the means of a quantity over the locking pieces of each cell; sums: its sums (cells, 1)."""
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add what theta and pi contribute to the tangent at the last update; the caller finalises it.
+        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises it.
 
-        sums: of what `add` asks for (cells, quantities), of each part of the pieces.
+        sums: for each part, the sums (cells, quantities) that `add` asked for.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
@@ -192,7 +192,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
-        """Return the gradients Delta (m, d, d) of the pieces, those that lock with the volume ratio of their cell."""
+        """Return the gradients Delta (m, d, d) of the pieces; locking ones take the volume ratio of their cell."""
         delta = delta.copy()
         for number in self._numbers:
             rows = data.rows[number]
@@ -204,12 +204,12 @@ class MeanDilatation:
         return [data.parts[number] for number in self._numbers]
 
     def _cells(self, data: QuadratureData) -> Cells:
-        """Return the cells that hold pieces that lock."""
+        """Return the cells with locking pieces."""
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the volumes (cells, 1) of the pieces that lock."""
+        """Return the volumes (cells, 1) of the locking pieces."""
         key = tuple(part.key for part in self._parts(data))
 
         def volumes() -> NDArray[np.float64]:
@@ -226,12 +226,12 @@ def _dev(tau, F):
 
 
 class StressAtPoints:
-    """The stress P of a law and its slope by theta at the points of a part: what residual and pi take, evaluated once.
+    """The stress P of a law and its derivative by theta at the points of a part, evaluated once for residual and pi.
 
     Parameters
     ----------
     P, slope
-        UFL (d, d) and scalar at the points.
+        UFL expressions at the points: (d, d) and scalar.
     points
         The points.
     """
@@ -241,10 +241,10 @@ class StressAtPoints:
         self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
         stress = points.follow("stress of the law", shape, self._stress)
         self.P = block(stress) if points.grid.axisymmetric else stress
-        """The stress as UFL, of the values that were evaluated last."""
+        """The stress as UFL, with the values of the last evaluation."""
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate both at the points, and return the sums (cells, 1) of the slope in their cells."""
+        """Evaluate stress and derivative at the points; return the sums (cells, 1) of the derivative in their cells."""
         _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
         return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
 
@@ -252,19 +252,19 @@ class StressAtPoints:
         """Return the stresses (n, d^2), Pa."""
         of, values = self._last.value or (None, None)
         if of is not data.key:
-            raise RuntimeError("stresses of points are asked for before they are evaluated")
+            raise RuntimeError("stresses at points are used before their evaluation")
         return values[:, :-1]
 
 
 class Cells:
-    """The cells of several parts; filled: all, where: the place of each part's among these."""
+    """The cells of several parts; filled: all of them; where: indices of each part's cells in `filled`."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums over all parts of what the cells of each hold."""
+        """Return the sums (cells, quantities) over all parts."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Balance of momentum: quasi-static, Q1 on the grid, evaluated at the pieces of the points' domains.
+"""Balance of momentum: Q1 on the grid, integrated over pieces, the parts of particle domains in cells.
 
-With Delta = I + grad u for the increment u since the start of the step, F = Delta F_n and J = det F,
-the residual is the derivative of
+The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J = det F. The residual is the
+derivative of
 
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
 
-that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions, P' the
-first Piola-Kirchhoff effective stress relative to the start of the step; a law may also give the stress
-itself.  The derivatives are UFL's.
+that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions. P' is the first
+Piola-Kirchhoff effective stress relative to the start of the step. A law may also give the stress. UFL takes the
+derivatives.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatric
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
+from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -41,7 +42,7 @@ from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.weight import Weight
-from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
+from mpm_dolfinx.points.parts import OfParts, Parts, relative
 from mpm_dolfinx.pores.retention import Retentions
 
 
@@ -51,28 +52,28 @@ class MomentumForms:
     Parameters
     ----------
     pieces
-        All points of integration.
+        All integration points.
     laws
-        Classes of the skeletons' laws, each with the pieces that follow it and whether these see the mean dilatation of
-        their cell, see `MeanDilatation`; they carry F, what the law takes and, with fluid, biot.
+        Classes of the skeletons' laws, each with its integration points and whether it takes F-bar, see
+        `MeanDilatation`. The points carry F, the law's parameters and state and, with fluid, biot.
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
-        Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3, at the start of the step.
+        Acceleration, a UFL constant; the points then carry `density`, kg/m^3, at the start of the step.
     fluid_density : kg/m^3
-        Of the pore fluid, which pores that widen take up; None without.
+        Density of the pore fluid that fills pores as they dilate; None without fluid.
     symmetric
         Whether the tangents of all laws are symmetric.
     at_points
         Whether bodies are integrated at their points.
     terms
-        The user's, see `user_functions`.
+        User-defined terms, see `user_functions`.
     t, dt : s
         Time at the end of the substep, and time since the start of the step, UFL constants.
     inertia
         Whether bodies may have inertia.
     retentions
-        The laws of retention of the scene, where some pores drain; the pieces then carry retention, lever and pores.
+        Retention laws of the scene, if some soil is unsaturated; the points then carry retention, lever and pores.
     """
 
     def __init__(
@@ -94,14 +95,14 @@ class MomentumForms:
         self._retentions = retentions
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
-        """Increment of the displacement since the start of the step, m."""
-        self._rooms = [fem.Function(V) for _ in range(3)]  # for sums of forces that are needed at once
+        """Displacement increment since the start of the step, m."""
+        self._rooms = [fem.Function(V) for _ in range(3)]  # buffers for simultaneous sums of forces
         averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
         self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
-        """Of bodies that may have inertia."""
+        """Forms of inertia, None without."""
         self._residuals, self._tangents = [], []
-        self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
+        self._local: dict[int, LocalUnknowns] = {}  # by index of the part
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(
                 number, law, points, locks, pressure, symmetric, by_scene(grid, None, law, points) | {"dt": dt}
@@ -113,13 +114,16 @@ class MomentumForms:
         full = None if retentions is None else retentions.of("saturation", pressure, pieces)
         self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
-        """What acts in all stages."""
+        """Loads that act in all stages."""
         self.symmetric = symmetric and self.own.symmetric
         self.linear = not averaged and all(law.linear for law, *_ in laws)
-        """Whether the tangent of the laws changes with the places of the points only."""
+        """Whether the tangent of the laws depends on the positions of the points only."""
         self.elastic = not any(law.state for law, *_ in laws)
-        """Whether no law has a history: where soil yields, the tangent of one substep leads the next astray."""
+        """Whether no law has a state: in yielding soil the tangent of one substep misleads the next."""
         self.ghost = GhostPenalty(grid, V, at_points)
+        kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *self._rooms)]
+        self.active = Active(grid, pressure is not None, *kept)
+        """The active cells; u is zero at other nodes."""
 
     def _add_law(
         self,
@@ -131,7 +135,7 @@ class MomentumForms:
         symmetric: bool,
         given: Mapping[str, fem.Constant],
     ) -> None:
-        """Compile residual and tangent of the pieces that follow a law."""
+        """Compile residual and tangent of the integration points of a law."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
         seen = self.dilatation.seen(points, F) if locks else F
@@ -140,7 +144,7 @@ class MomentumForms:
             values, known = values | local.values, values | local.known
         else:
             known = values
-        # derived by F and contracted: in 3D a twentieth of the compile time of derivatives by u
+        # derivatives by F, contracted: they compile in a twentieth of the time of derivatives by u in 3D
         beside = Beside()
         if locks:
             ratio = ufl.det(points.increment(self.u))
@@ -152,7 +156,7 @@ class MomentumForms:
             if self._retentions is not None:
                 of_pressure = self._retentions.of("bishop", pressure, points) * of_pressure
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
-        share = 1 / ufl.det(points.F)  # divided by it, each component would be
+        share = 1 / ufl.det(points.F)  # a common factor: dividing would divide each component
         P, A = share * P, share * A
         stress = P * points.F.T
         turns = self.inertia is not None and not self.grid.axisymmetric
@@ -165,10 +169,17 @@ class MomentumForms:
         else:
             self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
 
+    def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Set the contents of the owned cells (n,) that are not empty, and the active set: see `GhostPenalty`."""
+        self.active.clear()
+        cells = self.ghost.set_contents(own, *contents)
+        self.active.set(cells, np.flatnonzero(self.active_nodes(cells)))
+        return cells
+
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the sum of the nodal forces that are added, of all processes, in one of the rooms for local arrays."""
+        """Return the sum of nodal forces over all processes, in buffer `room`, a local array; adders add the forces."""
         out = self._rooms[room]
-        out.x.array[:] = 0.0
+        out.x.array[self.active.dofs] = 0.0
         for add in adders:
             add(out.x.array)
         return sum_ghosts(out)
@@ -179,7 +190,7 @@ class MomentumForms:
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u, and of loads that count as such, a local array."""
+        """Return the nodal forces of the stresses at u, a local array, with `Loads.takes_up`."""
 
         def solve() -> None:
             for number, local in self._local.items():
@@ -196,7 +207,7 @@ class MomentumForms:
         return self.summed(0, [add, *(one.takes_up for one in loads)])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
-        """Add the tangent of the stresses at u to K, which the caller finalises."""
+        """Add the tangent of the stresses at u to K; the caller finalises it."""
         for number, local in self._local.items():
             local.derive(data.parts[number])
         sums = [tangent.assemble_matrix(K, part) for tangent, part in zip(self._tangents, data.parts, strict=True)]
@@ -204,29 +215,32 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (nodes,) at the local nodes of what owned cells, of all processes, have (cells,)."""
-        shared, nodes = self._rooms[0], self.grid.cell_nodes[cells]
-        sums = sum_by(nodes.ravel(), np.repeat(values, nodes.shape[1]), len(self.grid.node_x))
-        shared.x.array[:] = np.repeat(sums, self.grid.dim)
+        """Return the sums (nodes,) at the active local nodes of values (cells,) of owned cells, over all processes."""
+        shared, d = self._rooms[0], self.grid.dim
+        nodes, at = np.unique(self.grid.cell_nodes[cells], return_inverse=True)
+        shared.x.array[self.active.dofs] = 0.0
+        shared.x.array[nodes * d] = sum_by(at.ravel(), np.repeat(values, 2**d), len(nodes))
         sum_ghosts(shared)
         shared.x.scatter_forward()
-        return shared.x.array[:: self.grid.dim].copy()
+        return shared.x.array[self.active.nodes * d]
 
-    def parts(self, active: NDArray[np.bool_]) -> Parts:
-        """Return the parts of the bodies in active cells (cells,).
+    def parts(self, of: NDArray[np.int64], count: int) -> Parts:
+        """Return the connected parts of the bodies in active cells, from the parts of the cells: see `parts_of_cells`.
 
-        Groups press on one another through their contacts: they are one part.
+        Contact couples the groups of bodies: with several groups there is one part.
         """
-        of, count = parts_of_cells(self.grid, active)
-        if self.grid.copies > 1:
-            of, count = active.astype(np.int64), 1
-        own = np.flatnonzero(active[: self.grid.num_owned])
-        total, cells = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
-        nodes = np.divide(total, cells, out=np.zeros(len(cells)), where=cells > 0)
-        return Parts(count, of - 1, np.rint(nodes).astype(np.int64) - 1)
+        grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
+        if grid.copies > 1:
+            cells = np.full(grid.num_local, -1)
+            cells[self.active.cells] = nodes[self.active.nodes] = 0
+            return Parts(1, cells, nodes)
+        own = self.active.cells[self.active.cells < grid.num_owned]
+        total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
+        nodes[self.active.nodes] = np.rint(total / count_of).astype(np.int64) - 1
+        return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return which nodes belong to some active cells of any process."""
+        """Return the nodes of active cells of any process."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
@@ -239,14 +253,14 @@ class MomentumForms:
 
 
 class MomentumSystem:
-    """Vectors and matrices of the displacements of one active set, complete when made.
+    """Vectors and matrices of the displacements of one active set.
 
     Parameters
     ----------
     forms
         The forms.
     dofs
-        Unrolled local degrees of freedom, ghosts included, that are unknowns.
+        Unrolled local degrees of freedom that are unknowns, ghosts included.
     nodes
         Active local nodes, ghosts included.
     cells
@@ -254,9 +268,9 @@ class MomentumSystem:
     facets
         Faces of this process that carry the ghost penalty.
     stiff
-        Whether sides have plates or given displacements.
+        Whether plates or prescribed displacements have a penalty.
     parts
-        Parts of the bodies.
+        Connected parts of the bodies.
     """
 
     def __init__(
@@ -270,60 +284,56 @@ class MomentumSystem:
         parts: Parts,
     ):
         self._forms, d = forms, forms.grid.dim
-        self.unknowns = Unknowns(forms.u, dofs)
+        self._nodes = nodes
+        self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
         self.locks = forms.dilatation is not None
-        """Whether laws yield or hardly change their volume."""
+        """Whether some law takes F-bar: it yields, or is nearly incompressible."""
         owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
         self.touched = (owned[:, None] * d + np.arange(d)).ravel()
-        """Where forces may act, held by walls or not."""
+        """Degrees of freedom on which forces may act, fixed or free."""
         self.parts, comm = parts, forms.grid.comm
         self.of_parts, self._touched = (
             OfParts(comm, parts.nodes[at // d], parts.count) for at in (self.unknowns.owned, self.touched)
         )
-        """Parts of the unknowns."""
+        """Parts of the unknowns, and of the degrees of freedom `touched`."""
         self.rounding = self.unknowns.vector()
-        """What rounding may leave of the residual at each unknown, N."""
+        """Rounding error of the residual at each unknown, N."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         every = (nodes[:, None] * d + np.arange(d)).ravel()
-        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs))
-        """What walls hold."""
+        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs), forms.grid.node_x)
+        """Degrees of freedom that walls of the grid fix."""
         self.held_residual = self.held.vector()
         self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
         at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
-        at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
+        at_walls[np.setdiff1d(every, dofs) // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
         self._ghost = forms.ghost.on(facets, facets[near])
-        self.firm, self._firmness = None, None  # where nothing yields
+        self.firm, self._firmness = None, None  # without laws that yield
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
 
     @property
-    def local_parts(self) -> NDArray[np.int64]:
-        """Parts (n,) of the degrees of freedom of this process, ghosts included, -1 where nothing is."""
-        return np.repeat(self.parts.nodes, self.unknowns.dim)
-
-    @property
     def round_off(self) -> NDArray[np.float64]:
-        """What rounding may leave of the residual of each part (parts,), N."""
+        """Rounding error of the residual of each part (parts,), N."""
         return self.of_parts.norms(self.rounding.array_r)
 
     def force_of_parts(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the norms (parts,), N, of forces where these may act, see `touched`."""
+        """Return the norms (parts,), N, of forces on the degrees of freedom `touched`."""
         return self._touched.norms(forces)
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
-        """Set what rounding may leave of the residual at the local nodes, N."""
-        self.rounding.array_w[:] = nodes[self.unknowns.owned // self.unknowns.dim]
+        """Set the rounding error of the residual at the active local nodes, N."""
+        self.rounding.array_w[:] = nodes[np.searchsorted(self._nodes, self.unknowns.owned // self.unknowns.dim)]
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], ...] | None:
-        """Lines of a grid of cells of many sizes: see `multigrid_solver`."""
+        """Lines of a grid of many cell sizes, else None: see `multigrid_solver`."""
         grid = self._forms.grid
         return None if grid.even else grid.lines
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return where on the grid this process's unknowns are, and what walls hold: see `multigrid_solver`."""
+        """Return the grid positions of this process's unknowns and fixed degrees of freedom: see `multigrid_solver`."""
         held = np.setdiff1d(self.touched, self.unknowns.owned)
         node, axis = np.divmod(np.concatenate([self.unknowns.owned, held]), self.unknowns.dim)
         places = self._forms.grid.node_places(node)
@@ -331,7 +341,7 @@ class MomentumSystem:
         return places[: self.unknowns.size], places[self.unknowns.size :]
 
     def _penalty_matrix(self, rows: Unknowns, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
-        """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
+        """Return an empty matrix for the penalties; the ghost penalty couples equal components of two cells."""
         grid = self._forms.grid
         d = grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
@@ -343,7 +353,7 @@ class MomentumSystem:
         return A
 
     def set_penalty(self, loads: Sequence[Loads]) -> None:
-        """Assemble what is linear in the step's increment: ghost penalty, that of loads, and firmness."""
+        """Assemble the terms linear in the step's increment: ghost penalty, penalties of loads, regularisation."""
         for penalty in (self.held_penalty, self.penalty):
             zero(penalty)
             for one in (self._ghost, *loads):
@@ -361,17 +371,17 @@ class MomentumProblem:
     Parameters
     ----------
     forms, system
-        Compiled forms; vectors and matrices, with the penalties in them.
+        Compiled forms; vectors and matrices, with assembled penalties.
     data
-        The pieces.
+        Integration points.
     loads
-        What acts on the bodies.
+        Loads on the bodies.
     tolerance
-        Share of the forces to which they are balanced.
+        Tolerance of the residual, relative to the forces.
     goes_on : (unknowns,)
-        Displacements if the bodies moved on as they did before, a local array, m; None where that is not known.
+        Displacements extrapolated from the last step, a local array, m; None if they are unknown.
     held : (unknowns,)
-        Forces that hold what is out of balance of an initial stress, a local array, N, if there are any.
+        Forces that balance an initial stress out of equilibrium, a local array, N, if there are any.
     yielded
         Whether any soil has yielded before.
     """
@@ -404,53 +414,48 @@ class MomentumProblem:
 
     @property
     def linear(self) -> bool:
-        """Whether the tangent changes with the places of the points only."""
+        """Whether the tangent depends on the positions of the points only."""
         return self.forms.linear and all(one.linear for one in self.loads)
 
     @property
     def smooth(self) -> bool:
-        """Whether the tangent of one substep may lead the next."""
+        """Whether the tangent of one substep may be used in the next."""
         return self.forms.elastic and all(one.smooth for one in self.loads)
 
     @cached_property
     def at(self) -> At:
-        """The displacements at present."""
+        """The present displacements."""
         return At(self.system.unknowns, self.forms.u.x.array)
 
     def settle(self, sticks: bool) -> bool:
-        """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
+        """Update the slip set at u, and with `sticks` also return cells to stick; return whether it has changed."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
-    def augment(self, forces: NDArray[np.float64]) -> bool:
-        """Let what is in balance go on with other forces, or at other places; return whether these are others.
-
-        forces (parts,): what residuals are measured by, N.
-        """
-        unknown = (self.system.round_off + self._tolerance * forces)[self.system.parts.cells]
-        return any([one.augment(self.at, unknown) for one in self.loads]) or any(
-            [one.follow(self.at) for one in self.loads]
-        )
+    def augment(self) -> bool:
+        """Update multipliers and contact geometry of converged loads; return whether any force has changed."""
+        return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
 
     def guesses(self) -> list[NDArray[np.float64]]:
-        """Return displacements (local unknowns,), m, at which Newton's method may begin.
+        """Return initial guesses of Newton's method: displacements (active dofs,), m.
 
-        Those that loads guess, as of a turn, and those of bodies that move on as before.
+        They are guesses of the loads, such as a rigid rotation, and the extrapolation of the last step.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
-        return [np.where(self.system.unknowns.map.indices >= 0, values, 0.0) for values in found]
+        dofs = self.forms.active.dofs
+        return [np.where(self.system.unknowns.map.indices[dofs] >= 0, values[dofs], 0.0) for values in found]
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
+        """Return the out-of-balance nodal forces at u and their scale, N: the largest norm of the force terms."""
         r, scales = self.residual_of_parts()
         return r, float(np.linalg.norm(scales))
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
-        """Return the out-of-balance nodal forces at u and the scales (parts,), N, of each part: see above."""
+        """Return the out-of-balance nodal forces at u and their scale (parts,), N, in each part."""
         system = self.system
         b, norms = self._unbalanced()
-        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
-        b[system.touched] -= self._pulls  # no measure of forces: at the start of a step they are far above them
+        system.held.gather(b, system.held_residual)  # walls bear the penalty forces of sides next to them
+        b[system.touched] -= self._pulls  # not in the scale: at the start of a step they far exceed the forces
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(self.forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
@@ -462,11 +467,11 @@ class MomentumProblem:
         return r, np.max(norms, axis=0)
 
     def unbalanced(self) -> NDArray[np.float64]:
-        """Return the forces of the stresses less those of loads at u, a local array, N; without what holds sides."""
+        """Return the forces of the stresses less the loads at u, a local array, N, without penalties."""
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the same, and the norms (parts,), N, of its parts."""
+        """Return the same, and the norms (parts,), N, of its terms."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -483,14 +488,14 @@ class MomentumProblem:
         return b, norms
 
     def powers(self) -> dict[str, float]:
-        """Return powers at u on this process, W: of stresses, of what resists velocity or slip, and of what acts."""
+        """Return powers at u on this process, W: of stresses, viscous resistance, friction and external loads."""
         forms, unknowns = self.forms, self.system.unknowns
-        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # none of what walls hold
+        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # zero at fixed nodes
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
         out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "friction": 0.0}
         out["external"] = 0.0
         for one in self.loads:
-            acts, resists = np.zeros((2, len(v)))  # those on ghosts count where they are added
+            acts, resists = np.zeros((2, len(v)))  # contributions to ghosts count on this process
             one.dead(acts)
             one.loads(acts)
             one.resists(resists)
@@ -506,10 +511,10 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return residuals r (N) of the parts, relative to scales (parts,), N: what counts of them, and as they are.
+        """Return relative residuals of the parts, without rounding and in full; r: residuals, N; scales (parts,), N.
 
-        What rounding may leave at a node does not count, but at first: a tiny load drowns in it, which is no reason not
-        to solve for it once.  The other ones are relative to no less than what makes this the tolerance.
+        The first result leaves out the rounding error at each node, except at first: one solve is made even for a load
+        below the rounding error. The second result takes scales of at least rounding error over tolerance.
         """
         system, parts = self.system, self.system.of_parts
         size, rounding = np.abs(r.array_r), system.rounding.array_r
@@ -520,7 +525,7 @@ class MomentumProblem:
         return counts, relative(told, np.ones(parts.count))
 
     def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
-        """Return the forces (d,), N, of the walls by their names at u, where the residual was last assembled."""
+        """Return the forces (d,), N, of the walls by name at u; the residual must have been assembled there."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
         for one in self.loads:
@@ -532,7 +537,7 @@ class MomentumProblem:
         return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
 
     def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what conditions do to the bodies at u, by quantity and name."""
+        """Return the outcomes of the conditions at u, by quantity and name."""
         out: dict[str, dict[str, NDArray[np.float64]]] = {}
         for one in self.loads:
             for quantity, values in one.outcome(self.at).items():
@@ -542,12 +547,12 @@ class MomentumProblem:
     def assemble_tangent(
         self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0
     ) -> PETSc.Mat:
-        """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness.
+        """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
-        firmness: the share, one number or one for each part.
+        data: other integration points than the problem's; firmness: the fraction, one number or one for each part.
         """
         K = self.system.K
-        # the first sums give K the pattern of all: PETSc does not always see that it changes later
+        # the first sums give K its full pattern: PETSc does not always notice a later change
         first = not K.assembled
         zero(K)
         self.forms.assemble_tangent(K, data or self.data)

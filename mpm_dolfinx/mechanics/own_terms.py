@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Terms of the user's own in the balance of momentum, in bodies and on sides: see `user_functions`."""
+"""User-defined terms in the balance of momentum, in bodies and on sides: see `user_functions`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.user_functions import compiling, term_of
 
 
 class OwnTerm(NamedTuple):
-    """A term: as it was given, its points, its form, and the derivative of that by u if it depends on it."""
+    """A user-defined term: its definition, its points, its form, and the form's derivative by u, None if it is zero."""
 
     given: Callable | OnSide
     points: FormPoints
@@ -32,16 +32,16 @@ class OwnTerm(NamedTuple):
 
 
 class OwnTerms:
-    """The terms of a scene, for all of its stages.
+    """The user-defined terms of a scene, for all of its stages.
 
     Parameters
     ----------
     terms
         Functions, or functions on sides.
     pieces
-        All points of integration.
+        All integration points.
     forms
-        Those of the scene's conditions, with u and the velocity of the bodies.
+        Forms of the scene's conditions, with u and the velocity of the bodies.
     t, dt : s
         Time at the end of the substep, and time since the start of the step, UFL constants.
     """
@@ -57,7 +57,7 @@ class OwnTerms:
         self.symmetric = True
         self.holding = False
         self.rates = False
-        """Whether all tangents are symmetric; whether some depend on u, and on the velocity."""
+        """Whether all tangents are symmetric; whether any term depends on u; whether any depends on the velocity."""
         u = forms.u
         more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
@@ -80,7 +80,7 @@ class OwnTerms:
 
 
 class OwnTermsOfStage(Acting):
-    """The terms in a stage: those on sides have faces."""
+    """The terms in a stage, with the faces of terms on sides."""
 
     title = "terms of the user's"
 
@@ -92,11 +92,11 @@ class OwnTermsOfStage(Acting):
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces."""
+        """Faces of the terms on sides."""
         return [faces for _, faces in self._terms if faces is not None]
 
     def placed(self, place: Place) -> Loads:
-        """Return the terms at the pieces, and at points of integration on sides."""
+        """Return the terms at the integration points of bodies and sides."""
         return OwnLoads([(term, self._data(term.points, faces, place)) for term, faces in self._terms])
 
     def _data(self, of: FormPoints, faces: Surface | None, place: Place) -> PointData:
@@ -112,7 +112,7 @@ class OwnTermsOfStage(Acting):
 
 
 class OwnLoads(Loads):
-    """Terms in a substep, with their points."""
+    """User-defined terms in a substep, with their points."""
 
     varies = True
 
@@ -127,7 +127,7 @@ class OwnLoads(Loads):
             term.form.assemble_vector(b, data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add their derivatives at u."""
+        """Add the derivatives of the terms at u."""
         for term, data in self._terms:
             if term.slope is not None:
                 term.slope.assemble_matrix(K, data)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid plates: an even traction, and a penalty on the slope of the side, kappa/2 int |grad_t u_n|^2 dA."""
+"""Rigid plates: a uniform traction, and a penalty on the slope of the side, kappa/2 int |grad_t u_n|^2 dA."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class PlateForms:
-    """Points under plates: what these resist a slope with, and what turns them back that are tilted."""
+    """Forms at points under plates: stiffness against a slope, and forces that reduce the present tilt."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
@@ -45,12 +45,12 @@ class PlateForms:
 
 
 class Plates(Acting):
-    """The plates of a stage.
+    """The rigid plates of a stage.
 
     Parameters
     ----------
     setting, plates
-        Where they are put, and the plates by name.
+        The stage, and its plates by name.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class Plates(Acting):
         ]
 
     def placed(self, place: Place) -> Loads:
-        """Return the plates on the surface, with their rigidity, normal and present tilt."""
+        """Return the plates in a substep, with their rigidity, normal and present tilt."""
         d = self._grid.dim
         rows = []
         grid = self._grid
@@ -86,7 +86,7 @@ class Plates(Acting):
             patches = place.cut.surface(faces)
             area = patches.area(place.points)
             length = faces.area0.sum() ** (1 / (d - 1))
-            modulus = oedometric[patches.at].max(initial=0.0)  # of what it lies on, wherever else stiffer bodies are
+            modulus = oedometric[patches.at].max(initial=0.0)  # of the material under the plate only
             rigidity = RIGIDITY * over_all(grid.comm, float(modulus), MPI.MAX) * length
             rigidity = rigidity * np.linalg.norm(area, axis=1, keepdims=True)
             axis = facing(faces)[0]
@@ -101,7 +101,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep; even: their tractions."""
+    """Plates in a substep; even: their uniform tractions."""
 
     stiff = True
 
@@ -111,7 +111,7 @@ class PlateLoads(Loads):
         self._even = even
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add the even tractions, and what turns plates back."""
+        """Add the uniform tractions, and the forces that reduce the tilt."""
         self._even.dead(b)
         self._forms.tilt.assemble_vector(b, self._data)
 
@@ -120,7 +120,7 @@ class PlateLoads(Loads):
         self._forms.bend.assemble_matrix(A, self._data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return plates that are tilted by so much more."""
+        """Return the plates with their tilt changed by a displacement u."""
         data, d = self._data, self._data.points.grid.dim
         slope = np.einsum("ni,nij->nj", data["normal"], data.gradients(u).reshape(-1, d, d))
         slope = slope - (slope * data["normal"]).sum(axis=1, keepdims=True) * data["normal"]
@@ -133,7 +133,7 @@ class PlateLoads(Loads):
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Refuse a plate on faces that are not one flat, connected side as seeded: each part would move by itself."""
+    """Refuse faces that are not one flat, connected side in the reference positions: each part would move by itself."""
     corners, axis = faces.places(), facing(faces)[0]
     tangential = np.arange(corners.shape[2]) != axis
     low = corners.min(axis=1)[:, tangential]
@@ -151,8 +151,8 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
         apart = np.flatnonzero(part != part[0])
     if len(apart):
         one, other = corners.mean(axis=1)[[0, apart[0]]]
-        where = "slope" if apart[0] == 0 else f"and {other} do not hang together at one height"
+        where = "slope" if apart[0] == 0 else f"and {other} are not connected at one height"
         raise ValueError(
             f"{line(plate)}: faces at {one} {where}, must be one flat side normal to an axis; "
-            "take a plate with a region for each"
+            "use one plate with a region for each"
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the pieces of a step carry: fields of the points and constants of their materials."""
+"""Data of the integration points of a step: fields of the material points and constants of their materials."""
 
 from __future__ import annotations
 
@@ -21,43 +21,43 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
 TOLD = 50
-"""Share of what corners tell in the volume ratios with which cells begin a step, over G / (lambda + 2G); at most all.
+"""Weight of the corner-based volume ratio of a cell at the start of a step, in units of G / (lambda + 2G), at most 1.
 
-The rest is what the points of a cell have: with nu = 0.4999 all of what corners tell would change stresses at a reset
-by more than bodies bear.
+The remaining weight is on the incremental volume ratio of the points. With nu = 0.4999 and a weight of 1 the stress
+changes at a reset of the grid would exceed the stresses that bodies carry.
 """
 STIFF = 8
-"""(lambda + 2G) / G from which on corners of wet bodies tell ever less: all with nu = 0.43, nothing from 0.47 on.
+"""Value of (lambda + 2G) / G at which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 from 0.47.
 
-What corners tell beside the Q1 field presses water out of such skeletons anew in every step, however short: with eight
-cells over a beam's depth its extreme pressures would be 43 % off with nu = 0.49, six to thirty times too large with
-0.499, and steps by error would never grow.
+The difference between corner-based ratio and Q1 field expels water from such skeletons in every step, however short.
+With a weight of 1 and eight cells over a beam's depth, its extreme pressures are 43 % off at nu = 0.49. At 0.499 they
+are six to thirty times too large, and adaptive steps never grow.
 """
 SHARE = 0.5
-"""Share of what a cell's gradient differs from its mean that laws see where all soil in it flows and dilates.
+"""Fraction of the deviation of the gradient from its cell mean that laws take in cells of flowing, dilatant soil.
 
-Flow that dilates by sin psi of its shear at four points asks too much of a Q1 cell also where the volume is its mean:
-a footing with associated flow, phi = 20 degrees, 9 and 17 cells over its width, then carries 4.4 and 3.4 % too much,
-and the load still rises.  With one point a cell it carries 6.6 and 3.2 % too little, and flows.
+Dilatant flow with a volume rate of sin psi times its shear rate at four points over-constrains a Q1 cell, even with
+F-bar. A footing with associated flow, phi = 20 degrees, 9 and 17 cells over its width, then carries 4.4 and 3.4 % too
+much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % too little, and flows.
 """
 
 
 def told_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return how much of the volume ratio with which its cells begin a step is what the domains' corners tell."""
+    """Return the weight of the corner-based volume ratio at the start of a step in the cells of a material."""
     stiffness = material.oedometric / material.shear
     return np.clip(2 - stiffness / STIFF, 0.0, 1.0) if wet else np.minimum(1.0, TOLD / stiffness)
 
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """The pieces of a step, those of each part of them (`SceneMaterials.parts`), and which these are."""
+    """Integration points of a step; points of each part (`SceneMaterials.parts`); rows of each part in the former."""
 
     pieces: PointData
     parts: tuple[PointData, ...]
     rows: tuple[NDArray[np.int64] | slice, ...]
 
     def shape_gradients(self) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions where laws see them."""
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the points where laws evaluate them."""
         if self.parts[0] is self.pieces:
             return self.pieces.places.shape_gradients(slice(None))
         n, d = self.pieces.x.shape
@@ -69,9 +69,9 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Where the pieces of a cut lie, and which rows of them belong to each of several parts, with their places.
+    """Positions of the pieces of a cut, with rows and positions of each part.
 
-    lever (m, d), m: ways to the pieces from the centroids of what their cells hold, once these are known.
+    lever (m, d), m: vectors to the pieces from the centroid of the material in their cell, once they are known.
     """
 
     pieces: Places
@@ -80,7 +80,7 @@ class PiecePlaces:
 
 
 class QuadraturePoints:
-    """The pieces as points of integration, with the fields that the scene's forms take.
+    """The pieces as integration points, with the fields of the scene's forms.
 
     Parameters
     ----------
@@ -93,18 +93,18 @@ class QuadraturePoints:
     weighs
         Whether there is gravity.
     extended
-        Whether functions of the user's may ask for anything that the points carry.
+        Whether user-defined functions may use any data of the points.
 
     Attributes
     ----------
     pieces
-        The points of integration.
+        The integration points.
     laws
-        Each law with the pieces that follow it, and whether they see the mean dilatation, see `SceneMaterials.parts`.
+        Each law with its integration points, and whether it takes F-bar, see `SceneMaterials.parts`.
     varies
         Whether mobilities change with the deformation.
     layered
-        Whether points differ in what they conduct.
+        Whether the conductivity differs between points.
     """
 
     def __init__(self, grid: Grid, scene: SceneMaterials, fluid: Fluid | None, weighs: bool, extended: bool):
@@ -136,7 +136,7 @@ class QuadraturePoints:
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
 
     def places(self, cut: CutDomains) -> PiecePlaces:
-        """Return where the pieces of a cut lie."""
+        """Return the positions of the pieces of a cut."""
         pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, cut.hoop), []
         seen = self._seen(cut, pieces)
         if len(self.laws) > 1 or seen is not pieces:
@@ -146,7 +146,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _seen(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return where laws see the gradient: the pieces, but where soil flows and dilates, see `SHARE`."""
+        """Return the positions at which laws take the gradient: shifted in flowing, dilatant soil, see `SHARE`."""
         if not self._scene.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self._scene.dilating(cut.points))
@@ -163,7 +163,7 @@ class QuadraturePoints:
         return Places(self._grid, cut.cells, middle + share * (cut.x - middle), mixed)
 
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
-        """Return the pieces with all their data: those of a cut, with what the points carry now."""
+        """Return the integration points of a cut with all their data, from the present points."""
         changing = {name: cut.to_cells(values) for name, values in self._changing(points).items()}
         fields = {**self._constant(cut, points), **changing, **self._own(cut, points)}
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
@@ -174,7 +174,7 @@ class QuadraturePoints:
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
             if ACROSS in fields:
                 fields[ACROSS] = np.cbrt(factor) * fields[ACROSS]
-            if self._weighs:  # points weigh what they do, however large cells see them
+            if self._weighs:  # the weight of a point does not depend on the cell's volume ratio
                 fields["density"] = fields["density"] / factor
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
@@ -184,7 +184,7 @@ class QuadraturePoints:
         return QuadratureData(pieces, data, tuple(rows for rows, _ in places.parts))
 
     def _constant(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return what the materials bring to their pieces for good."""
+        """Return the constants of the materials at the integration points."""
         values = tuple(points.data[name] for name in self._scene.field_names)
 
         def make() -> dict[str, NDArray[np.float64]]:
@@ -204,10 +204,10 @@ class QuadraturePoints:
         return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return what the points bring to their pieces and what changes with them."""
+        """Return the data of the points that change from step to step."""
         fields = {"F": points.F, **self._scene.state(points)}
         fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
-        if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
+        if self._extended:  # fields of laws are known for all materials; in `data` they are zero at points of others
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:
             fields["storage"] = self._scene.storage(points)
@@ -218,7 +218,7 @@ class QuadraturePoints:
         return fields
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return what differs from piece to piece of a point, where functions of the user's may ask for it."""
+        """Return the data that differ between pieces of one point, if user-defined functions may use them."""
         fields = {}
         if self._extended or self.varies:
             fields["position"] = cut.pieces.x + cut.grid.base
@@ -227,13 +227,13 @@ class QuadraturePoints:
         return {name: cut.pieces_to_cells(values) for name, values in fields.items()}
 
     def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return a constant of the materials at the pieces (m,)."""
+        """Return a constant of the materials at the integration points (m,)."""
         return cut.to_cells(self._scene.table(points, value))
 
     def mobility(
         self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
     ) -> NDArray[np.float64]:
-        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s), by a law at the present u."""
+        """Return the mobility k / (rho_w g) at the integration points (m,), m^2/(Pa s), by a law at the present u."""
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
@@ -248,13 +248,13 @@ class QuadraturePoints:
         return self._scene.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return what pieces (m, 2) that conduct alike have in common."""
+        """Return a key (m, 2) for each integration point; points with equal keys conduct alike."""
         return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor.
+        """Return beta of the fixed-stress operator at the integration points, 1/Pa, before the scheme's factor.
 
-        `of_fluid`: 1/K_w, with which the plain iteration converges for stiff skeletons only.
+        of_fluid: return 1/K_w instead, with which the plain iteration converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The rigid motion that given displacements ask for: where Newton's method begins when a body is turned.
+"""The rigid motion nearest to prescribed displacements: the initial guess of Newton's method for bodies that rotate.
 
-A rotation by an angle a stretches a linearised field by a^2 / 2: soil that yields at less would take that for the
-motion, and no step would be short enough.
+A linearised rotation by an angle a causes a spurious stretch of a^2 / 2. Soil may yield at this stretch. Newton's
+method would then fail, however short the step.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.parallel.exchange import over_all
 
 TURNS = 1e-3
-"""Angle below which a body is not turned, rad."""
+"""Smallest rotation angle that counts, rad."""
 MEETS = 0.1
-"""Share of the gaps, as a shift of the body leaves them, that a turn may leave."""
+"""Largest gap after a rotation, relative to the gap after the best translation."""
 ITERATIONS = 9
 
 
 def rigid_motion(
     comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64], counts: NDArray[np.bool_]
 ) -> NDArray[np.float64] | None:
-    """Return the displacements (n, d), m, of places in the rigid motion nearest to given displacements.
+    """Return the displacements (n, d), m, at positions x in the rigid motion nearest to prescribed displacements.
 
     Parameters
     ----------
     comm
-        The processes; all call it together.
+        The processes; the call is collective.
     holds
-        Rows of given displacements: a direction, the gap along it, m, and the stiffness that it counts with.
+        Rows of prescribed displacements: direction, gap along it, m, and stiffness, the weight of the row.
     x : (n, d), m
-        The places.
+        The positions.
     counts : (m,)
-        Which rows count.
+        Rows that count.
 
     Returns
     -------
-    None where nothing is turned, or where a shift meets the given displacements nearly as well.
+    None for a pure translation, or if a translation meets the prescribed displacements nearly as well.
     """
     d = x.shape[1]
     e = holds["direction"]
@@ -56,14 +56,14 @@ def rigid_motion(
     shift = np.zeros(d)
     turn = Rotation.identity()
     size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
-    left = []  # sum of the squares of the gaps: of no turn at the second, of the nearest one at the end
+    left = []  # sum of squared gaps: second entry without rotation, last entry with the nearest one
     for iteration in range(ITERATIONS):
         turned = _apply(turn, arm)
         off = gap - np.einsum("nd,nd->n", e, shift + turned - arm)
         left.append(over_all(comm, float(weight[:, 0] @ off**2)))
         slope = np.concatenate([e, _spin(turned, e) / max(size, TINY)], axis=1)
         normal = over_all(comm, np.concatenate([slope.T @ (weight * slope), [slope.T @ (weight[:, 0] * off)]]))
-        part = slice(None) if iteration else slice(d)  # first without a turn
+        part = slice(None) if iteration else slice(d)  # first without rotation
         step = np.zeros(len(normal) - 1)
         step[part] = np.linalg.lstsq(normal[:-1][part, part] / moments[0], normal[-1][part] / moments[0], rcond=SAME)[0]
         shift = shift + step[:d]
@@ -77,9 +77,9 @@ def rigid_motion(
 def turned(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the rotation (d, d) nearest to the motion of weighted places x (n, d) to others, m (Kabsch 1976).
+    """Return the rotation (d, d) nearest to the motion of weighted positions x (n, d) to `to`, m (Kabsch 1976).
 
-    The identity where they are not turned, or where the rotation does not come near.  All processes call it together.
+    The result is the identity for a negligible rotation, or for a poor fit. The call is collective.
     """
     d = x.shape[1]
     sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))
@@ -95,13 +95,13 @@ def turned(
 
 
 def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors (n, d) turned, in the plane about its normal."""
+    """Return rotated vectors (n, d); 2D vectors rotate in their plane."""
     d = x.shape[1]
     return x @ turn.as_matrix()[:d, :d].T
 
 
 def _spin(x: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far places (n, d) move along directions e (n, d) as they are turned by a unit about each axis."""
+    """Return the velocity of positions x (n, d) along directions e (n, d) for unit rotation rates about each axis."""
     if x.shape[1] == 2:
         return (x[:, :1] * e[:, 1:] - x[:, 1:] * e[:, :1]).copy()
     return np.cross(x, e)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Loads on sides of the bodies, where these have moved to: dead tractions, and pressures that follow the surface.
+"""Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-A traction, force per reference area, is int t . v dA on the faces as seeded.  A pressure is -int p n . v da over the
-present area, with its tangent.  That is symmetric but for the boundary of the surface, whose edges dx contribute
-p/2 (v x du) . dx: nothing where two surfaces of one pressure meet, and on a wall that holds the normal component, for
-there v, du and the edge lie in the wall.
+A traction, force per reference area, is int t . v dA on the reference faces. A pressure is -int p n . v da over the
+present area, with its tangent. The tangent is symmetric except for the boundary of the surface, whose edges dx
+contribute p/2 (v x du) . dx. This term vanishes where two surfaces of equal pressure meet. It also vanishes on a wall
+that fixes the normal component, because v, du and the edge lie in the wall.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class SideLoads(Acting):
     Parameters
     ----------
     setting, loads
-        Where they are put, and the loads by name.
+        The stage, and its loads by name.
     """
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
@@ -47,16 +47,16 @@ class SideLoads(Acting):
         self._loads = [(load, setting.sides.of(load)) for load in loads.values()]
         self._placed: Latest[tuple[Exchange, Places]] = Latest()
         for load in loads.values():
-            if not callable(load.value):  # what a function gives is checked when it is called
+            if not callable(load.value):  # values of functions are checked when they are called
                 self._given(load, 0.0, None)
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces."""
+        """Faces of the loads."""
         return [faces for _, faces in self._loads]
 
     def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
-        """Return points of integration in owned cells, and the forces (n, d), N, on them."""
+        """Return integration points in owned cells, and the forces (n, d), N, at them."""
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
@@ -65,18 +65,18 @@ class SideLoads(Acting):
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
-        """Return the value of a load at time t (s) at places on its side."""
+        """Return the value of a load at time t (s) at the positions on its side."""
         raise NotImplementedError
 
     def _on(
         self, load: Any, value: NDArray[np.float64], patches: Patches, points: MaterialPoints
     ) -> NDArray[np.float64]:
-        """Return its forces (n, d), N, on the points of integration of its side."""
+        """Return the forces (n, d), N, of a load at the integration points of its side."""
         raise NotImplementedError
 
 
 class DeadForces:
-    """Points with a force, and its work."""
+    """Forms of the work of point forces."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, force=(grid.dim,))
@@ -89,7 +89,7 @@ class Tractions(SideLoads):
     conditions, title = (Traction,), "tractions"
 
     def placed(self, place: Place) -> Loads:
-        """Return the forces on the surface."""
+        """Return the forces of the tractions on the surface."""
         (places, force), forms = self.forces(place), self._forms(DeadForces)
         return DeadLoads(forms.work, PointData(forms.points, places, np.ones(len(force)), {"force": force}))
 
@@ -106,7 +106,7 @@ class Tractions(SideLoads):
 
 
 class DeadLoads(Loads):
-    """Forces that do not depend on the displacement: a linear form, and where it is integrated."""
+    """Forces that do not depend on the displacement."""
 
     def __init__(self, work: PointForm, data: PointData):
         self._work, self.data = work, data
@@ -117,14 +117,14 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the way of loads on patches to the owners of their cells, and where they act."""
+    """Return the exchange of patch data to the owners of their cells, and their positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.local(travel.send(cell)), travel.send(x))
 
 
 class PressureForms:
-    """Points with the force of a pressure on the area at the start of the step; its work, and minus the derivative."""
+    """Forms of pressures, from their force on the area at the start of the step: work, and minus its derivative."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -148,7 +148,7 @@ class Pressures(SideLoads):
         self.symmetric = closed(self._grid, setting.free, self._loads)
 
     def placed(self, place: Place) -> Loads:
-        """Return the pressures on the surface, with their forces on its area at the start of the step."""
+        """Return the pressures, as forces on the area at the start of the step."""
         (places, push), forms = self.forces(place), self._forms(PressureForms)
         return PressureLoads(forms, PointData(forms.points, places, np.ones(len(push)), {"push": push}))
 
@@ -174,21 +174,21 @@ class PressureLoads(Loads):
         self._forms.work.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the tangent: as the surface moves it turns and stretches."""
+        """Add the tangent, due to rotation and stretch of the surface."""
         self._forms.slope.assemble_matrix(K, self._data)
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether the surfaces of equal pressures are closed, or end on walls that hold them.
+    """Return whether all surfaces of equal pressure are closed, or end on walls that fix their normal component.
 
-    Faces whose corners lie on the edges of others are taken to be open.
+    A surface counts as open where corners of faces lie on the edges of other faces.
 
     Parameters
     ----------
     free : (nodes, d)
-        Components that no wall holds.
+        Components that no wall fixes.
     pressures
-        With the faces on which they act.
+        Pressures and their faces.
     """
     if not pressures:
         return True
@@ -201,7 +201,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
 
 def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
-    """Return axis and place, m, of the walls that hold their normal component."""
+    """Return axis and position, m, of the walls that fix their normal component."""
     out = []
     for wall, (axis, end) in SIDES[grid.dim].items():
         if not over_all(grid.comm, int(free[grid.wall_nodes(wall), axis].sum())):
@@ -210,16 +210,16 @@ def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
 
 
 def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[Surface]) -> bool:
-    """Return whether every edge of some faces belongs to two of them, or lies in a wall that holds it."""
+    """Return whether every edge of the faces belongs to two of them, or lies in a fixed wall."""
     x = np.concatenate([faces.places() for faces in surfaces])
     count, edges = x.shape[1], _EDGES[grid.dim]
     number = np.rint(
         (x.reshape(-1, grid.dim) - grid.lower) / (NEAR * grid.finest) + 1 / 3
-    )  # on no half between two numbers
+    )  # off the midpoint between two integers
     _, corner = np.unique(number, axis=0, return_inverse=True)
     edge = np.sort(corner.reshape(-1, count)[:, edges].reshape(-1, edges.shape[1]), axis=1)
     x = x[:, edges].reshape(-1, edges.shape[1], grid.dim)
-    if grid.dim == 3:  # of a triangle two corners are the same
+    if grid.dim == 3:  # triangles have one corner twice
         real = edge[:, 0] != edge[:, 1]
         edge, x = edge[real], x[real]
     _, kind, often = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
@@ -231,4 +231,4 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
 
 
 _EDGES = {2: np.array([[0], [1]]), 3: np.array([[0, 1], [1, 3], [3, 2], [2, 0]])}
-"""Corners of the edges of a face; in 2D its ends."""
+"""Corners of the edges of a face; in 2D, its ends."""

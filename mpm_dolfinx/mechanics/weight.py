@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The weight of the bodies: int rho g . v dV, and of the pore fluid that pores take up as they widen in the step."""
+"""The weight of the bodies, int rho g . v dV, and of the pore fluid that fills dilating pores in the step."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Weight(Acting):
     Parameters
     ----------
     pieces
-        All points of integration; they carry `density`, kg/m^3, at the start of the step.
+        All integration points; they carry `density`, kg/m^3, at the start of the step.
     u
-        Increment of the displacement in the step.
+        Displacement increment of the step.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant.
     fluid_density : kg/m^3
-        Of the pore fluid; None without.
+        Density of the pore fluid; None without fluid.
     saturation
-        Of the pores, as UFL; None: they stay full.
+        Degree of saturation, as UFL; None for saturated soil.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Weight(Acting):
         self._dead, self._taken_up = PointForm(pieces.density * pull * pieces.dx, pieces), None
         if fluid_density is not None:
             grown = ufl.det(pieces.increment(u)) - 1
-            if saturation is not None:  # the weight is that of full pores so far
+            if saturation is not None:  # `density` is that of saturated soil
                 grown = saturation * grown - (1 - saturation) * pieces.pores
             grown = fem.Constant(pieces.grid.mesh, fluid_density) * grown
             self._taken_up = PointForm(-grown * pull * pieces.dx, pieces)
@@ -52,7 +52,7 @@ class Weight(Acting):
         return self
 
     def placed(self, place: Place) -> Loads:
-        """Return the weight of the pieces."""
+        """Return the weight at the integration points."""
         return WeightLoads(self._dead, self._taken_up, place.pieces.pieces)
 
 
@@ -64,6 +64,6 @@ class WeightLoads(DeadLoads):
         self._taken_up = taken_up
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add minus the weight of what pores take up at u."""
+        """Add minus the weight of the fluid that fills dilating pores at u."""
         if self._taken_up is not None:
             self._taken_up.assemble_vector(b, self.data)

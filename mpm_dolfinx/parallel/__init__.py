@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Several processes: who owns which cells, and rows that travel between them."""
+"""Several processes: exchange of array rows between cell owners, and messages."""

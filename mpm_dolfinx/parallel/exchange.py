@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Rows of arrays that travel to other processes, and answers that come back.
+"""Exchange of array rows between processes, with answers.
 
-The unit that travels is what lies in a cell (a piece of a domain, a corner, a loaded point): a cell
-integral is assembled by the rank that owns the cell.  On one process nothing is copied.
+A row belongs to a cell (a cut subdomain, a corner, a loaded point), because the owner of a cell assembles its
+integrals.  A single process copies nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @dataclass
 class Traffic:
-    """What exchanges have sent from this process to others so far: transfers, messages that were not empty, bytes."""
+    """Total exchanges from this process to others: transfers, non-empty messages, bytes."""
 
     transfers: int = 0
     messages: int = 0
@@ -38,9 +38,9 @@ class Exchange:
     Parameters
     ----------
     comm
-        The processes.
+        Processes of the exchange.
     destination : (n,)
-        Rank that each row goes to.
+        Target rank of each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
@@ -52,7 +52,7 @@ class Exchange:
         received, first_there = np.empty_like(sent), np.empty_like(sent)
         comm.Alltoall(sent, received)
         comm.Alltoall((np.cumsum(received) - received).astype(np.int32), first_there)
-        place = np.empty(len(destination), dtype=np.int32)  # of each row among those that its rank receives
+        place = np.empty(len(destination), dtype=np.int32)  # index of each row among the rows its rank receives
         place[order] = np.arange(len(destination)) + np.repeat(first_there - (np.cumsum(sent) - sent), sent)
         self._counts = len(destination), int(received.sum())
         self._away = tuple(np.delete(counts, comm.rank) for counts in (sent, received))
@@ -60,13 +60,13 @@ class Exchange:
         self._sf.setGraph(self._counts[1], None, np.column_stack([destination, place]).astype(PETSc.IntType))
 
     def send(self, rows: NDArray) -> NDArray:
-        """Return the rows that this rank received, ordered by sender."""
+        """Return the rows received by this rank, ordered by sender."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Return answers, one for each received row, to the senders in the order they sent."""
+        """Return answers, one a received row, to the senders in their order."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -75,7 +75,7 @@ class Exchange:
         rows = np.ascontiguousarray(rows)
         out = np.empty((self._counts[to], *rows.shape[1:]), dtype=rows.dtype)
         width = int(np.prod(rows.shape[1:], dtype=int))
-        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # entries may be more than an int counts
+        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # counts of entries may exceed an int
         away = self._away[1 - to]
         traffic.transfers += 1
         traffic.messages += int(np.count_nonzero(away))
@@ -87,7 +87,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the processes' values, arrays entry by entry, reduced by `op`; a single process has its own back."""
+    """Return the sum, or another reduction by `op`, of all processes' values; arrays entry by entry."""
     if comm.size == 1:
         return value
     if not isinstance(value, np.ndarray):
@@ -98,17 +98,17 @@ def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
 
 
 def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
-    """Return the exchange that takes this process's rows to rank 0."""
+    """Return the exchange that sends all rows of this process to rank 0."""
     return Exchange(comm, np.zeros(rows, dtype=np.int32))
 
 
 def first(comm: MPI.Intracomm, message: str) -> str:
-    """Return the first message of all processes that is not empty: what one of them refuses, all must."""
+    """Return the first non-empty message of all processes, so that all raise the error of one."""
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return on every process what rank 0 gets from `action`; all raise what it raises."""
+    """Return the result of `action` on rank 0 on every process; all raise its exception."""
     value = error = None
     if comm.rank == 0:
         try:

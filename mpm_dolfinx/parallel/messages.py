@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Messages of the package, once for all processes: log lines of a run, and warnings about its results."""
+"""Messages of the package, issued once for all processes: log lines and warnings."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages whose frames a warning passes by, to the line of the script that it is about."""
+"""Packages whose frames are skipped to find the script's line for a warning."""
 
 
 class ResultWarning(UserWarning):
-    """A result may not be what it seems; all warnings of the package are of this kind."""
+    """Base of all warnings of the package: a result may be misleading."""
 
 
 class ResolutionWarning(ResultWarning):
-    """Grid, points or steps are too coarse for what they are to resolve."""
+    """Grid, points or steps are too coarse."""
 
 
 class ConditionWarning(ResultWarning):
-    """Conditions, units, initial stresses or options contradict each other, or do nothing."""
+    """Conditions, units, initial stresses or options contradict each other, or have no effect."""
 
 
 def set_log_level(level: int | str) -> None:
-    """Show the log lines of runs from a level on, such as "INFO": steps that are cut, checkpoints.
+    """Show log lines of runs from a level on, such as "INFO" for step cuts and checkpoints.
 
-    They are shown on stderr, unless handlers of `logging` are there already.
+    Lines go to stderr, unless `logging` has handlers already.
 
     Parameters
     ----------
     level
-        A level of `logging`, by its name or number; "WARNING" is the default.
+        A level of `logging`, by name or number; "WARNING" is the default.
 
     Raises
     ------
     ValueError
-        There is no such level.
+        Unknown level.
     """
     try:
         logger.setLevel(level)
@@ -55,21 +55,21 @@ def set_log_level(level: int | str) -> None:
 
 
 def log(comm: MPI.Intracomm, message: str, *values, level: int = logging.INFO) -> None:
-    """Log a message."""
+    """Log a message on the first process."""
     if comm.rank == 0:
         logger.log(level, message, *values)
 
 
 def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *values) -> None:
-    """Issue a warning on the first process, at the line outside of the package that has led to it.
+    """Issue a warning on the first process, at the line of the script that led to it.
 
-    All processes call it together.  Where a filter turns it into an error, all of them raise it, with `told` unset:
-    the caller has changed nothing so far.
+    All processes call this together.  If a filter turns the warning into an error, all of them raise it.  A caller must
+    therefore warn before it changes anything.
     """
     raised = None
     if comm.rank == 0:
         try:
-            with tqdm.external_write_mode(sys.stderr):  # above the bar, not into it
+            with tqdm.external_write_mode(sys.stderr):  # prints above the progress bar
                 warnings.warn(message % values, category, stacklevel=_outside())
         except Warning as error:
             raised = error
@@ -80,7 +80,7 @@ def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *valu
 
 
 def _outside() -> int:
-    """Return how many calls outward, for the caller, the first frame is that is not of the package."""
+    """Return the number of frames from the caller to the first frame outside the package."""
     frame, level = sys._getframe(1), 1
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WITHIN:
         frame, level = frame.f_back, level + 1

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Material points, the cutting of their domains, and the parts that hang together."""
+"""Material points, the cutting of their particle domains by the grid, and connected parts of the bodies."""

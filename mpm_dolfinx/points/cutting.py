@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""The points' domains, cut by the grid into pieces that lie in one cell each.
+"""Particle domains, cut by the grid into pieces: the subdomains that lie in one cell each.
 
-A point stands for a quadrilateral or hexahedron of tracked corners.  Its pieces carry exact volumes
-and centroids, in 3D also their moments of products: gradients of Q1 functions are linear within a cell, in 3D bilinear,
-so one row of integration data a piece integrates them exactly, and the answer does not depend on how points lie on the
-grid.
+A point represents a quadrilateral or hexahedron with tracked corners. Its pieces have exact volumes and centroids, in
+3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear. One row of
+integration data for each piece therefore integrates them exactly, at any position of the points on the grid.
 
-The surface of a domain (4 edges, or in 3D 4 triangles a face about its middle, which match those of the neighbours and
-prefer no diagonal) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
-volumes and first moments of what lies between them and the lower face of their cell and, below it, of whole
-columns of cells: nothing inside a domain is ever cut, and the faces of the pieces come for free.
+The surface of a domain has 4 edges, or 4 triangles about the middle of each face in 3D. The triangles match the
+neighbours' and prefer no diagonal. The grid planes of one axis after the other slice this surface. Gauss's theorem
+gives volumes and first moments of the body between a slice and the lower face of its cell, and of the column of cells
+below. The interior of a domain is never cut, and the faces of the pieces follow at no cost.
 
-In axisymmetry pieces are rings.  Their volumes are 2 pi r_c times the area, r_c the radius of its centroid (Pappus).
-Gradients are taken at the volume's centroid, (mean r^2 / r_c, mean r z / r_c), and u_r / r is (mean u_r) / r_c, means
-over the area: the forces of even stresses are then exact.
+In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with r_c the radius of the area's centroid
+(Pappus). Gradients are evaluated at the volume's centroid, (mean r^2 / r_c, mean r z / r_c). The mean over the area
+gives u_r / r as (mean u_r) / r_c. The nodal forces of uniform stresses are then exact.
 """
 
 from __future__ import annotations
@@ -30,24 +29,23 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
-"""Of the domain: smaller pieces are dropped.  Those less than `Grid.snap` thin have an open face.  Source: epsilon."""
-CHUNK = 2**15  # simplices of domains that are cut at a time, in the processor's cache
-TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
+"""Least volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
+CHUNK = 2**15  # simplices cut at a time, for the processor's cache
+TANGLED = 0.2  # volume spanned by the corners over the domain's: below it corners are re-initialised from F
 
 
 @dataclass
 class Pieces:
-    """Domains cut by the cells; arrays over the pieces, ordered by point and cell.
+    """Particle domains cut by the cells; arrays over the pieces, ordered by point and cell.
 
     point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
-    fraction : (m,) share of the domain's volume; x : (m, d) centroid, m;
+    fraction : (m,) volume over the domain's volume; x : (m, d) centroid, m;
     faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1);
-    mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the axes other than each,
-    m^2;
-    hoop : (m, 4) in axisymmetry, else (m, 0): in the plane, offset (2,) of the centroid from the cell's midpoint, m,
-    mean product of the offset's components, m^2, and radius of the centroid, m;
-    second : (m, d, d) if they are asked for, else (m, 0): all mean products of the offsets from the centroid, m^2; in
-    axisymmetry of pieces that are symmetric in the plane.
+    mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2;
+    hoop : (m, 4) in axisymmetry, else (m, 0): of the section, offset (2,) of the centroid from the cell's midpoint, m;
+    mean product of the offset's components, m^2; radius of the centroid, m;
+    second : (m, d, d) on request, else (m, 0): second moments about the centroid over volume, m^2; in axisymmetry for
+    pieces that are symmetric in the plane.
     """
 
     point: NDArray[np.int64]
@@ -61,7 +59,7 @@ class Pieces:
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the (2^d, d) ends (0 lower, 1 upper) of the corners of a domain along each axis."""
+    """Return the ends (2^d, d) of the corners of a domain along each axis: 0 lower, 1 upper."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
@@ -74,14 +72,14 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Corners (2d, 2^(d-1)) of the faces of a domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Which way (6,) faces look whose corners are taken in turn, of quadrilaterals the first four: outward or inward."""
+"""Orientation (6,) of the faces by the order of their corners: 1 outward, -1 inward; the first four in 2D."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles that a face in 3D is split into: corners, and its middle, so that no diagonal is preferred."""
+"""Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
 
 @cache
 def kuhn_simplices(dim: int) -> NDArray[np.int64]:
-    """Return the (d!, d+1) corners of Kuhn's simplices of a domain or face."""
+    """Return the corners (d!, d+1) of Kuhn's simplices of a domain or face."""
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])
 
 
@@ -89,7 +87,7 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 def simplices(dim: int) -> NDArray[np.int64]:
     """Return the `vertices` (4 or 24, d+1) of the simplices of a domain: facets of its surface, and its middle.
 
-    They are alike under all turns and mirrors of the domain; the facets look outward.
+    The set is invariant under all rotations and mirrors of the domain; the facets look outward.
     """
     rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
     facets = []
@@ -119,9 +117,9 @@ def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative if they are turned inside out.
+    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative for inverted ones.
 
-    In 3D by faces: a third of the product of the middle of each and its area vector.
+    In 3D the sum runs over faces: a third of the product of each face's middle and area vector.
     """
     y = np.ascontiguousarray((corners - corners[:, :1]).transpose(1, 2, 0))
     if len(y) == 4:
@@ -144,7 +142,7 @@ def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains (n, 2^d, d), in axisymmetry of the rings that they stand for, m^3."""
+    """Return the volumes (n,), m^d, of domains (n, 2^d, d); in axisymmetry the volumes of their rings, m^3."""
     if not axisymmetric:
         return volumes(corners)
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
@@ -152,15 +150,15 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
 
 
 def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), one a column."""
+    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), as columns."""
     signs = 2.0 * corner_bits(corners.shape[2]) - 1
     return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centroids (n, d), m, of domains (n, 2^d, d), in axisymmetry in the plane: where their means count.
+    """Return the centroids (n, d), m, of domains (n, 2^d, d), in axisymmetry the centroids of their sections.
 
-    As in `cut`, simplices that are turned inside out count as positive.
+    As in `cut`, inverted simplices count with positive volume.
     """
     return np.concatenate([_centroids(corners[part]) for part in _chunks(len(corners), corners.shape[2])])
 
@@ -175,7 +173,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains (n, 2^d, d) have folded: their corners span far less, or more, than their volume (n,)."""
+    """Return the inverted domains (n, 2^d, d): their corners span far less, or more, than their volume (n,)."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -183,30 +181,30 @@ def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmet
 def parallelepipeds(
     x: NDArray[np.float64], F: NDArray[np.float64], spacing: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), m, of boxes of size `spacing` (n, d) about x (n, d), deformed by F (n, d, d)."""
+    """Return the corners (n, 2^d, d), m, of boxes of size `spacing` (n, d) at x (n, d), deformed by F (n, d, d)."""
     offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
 
 
 def _chunks(count: int, dim: int) -> list[slice]:
-    """Return so many domains in parts, one after the other, of which all simplices fit the processor's cache."""
+    """Return slices of `count` domains whose simplices fit into the processor's cache."""
     size = CHUNK // len(simplices(dim))
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
 
 def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Pieces:
-    """Cut the domains by the grid.
+    """Cut the particle domains by the grid.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
         Corners of the domains, inside the grid; corner k has the ends `corner_bits(d)[k]`.
     second
-        Whether second moments of the pieces are asked for.
+        Whether to compute second moments of the pieces.
 
     Returns
     -------
-    The pieces, slivers below 1e-12 of their domain left out; fractions sum to one for every domain.
+    The pieces, without slivers below 1e-12 of their domain; fractions sum to one for every domain.
     """
     chunks = _chunks(len(corners), grid.dim)
     parts = [_cut(grid, corners[chunk], second) for chunk in chunks]
@@ -219,14 +217,15 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Piece
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places in cells from the grid's lower corner, and as edges are straight: what is near planes on them.
+    """Return positions in cells from the grid's lower corner, and positions for slicing, both snapped to nearby planes.
 
-    Edges of domains are straight in cells that are equal; else the second are in m, from the base.
+    Edges of domains are straight in metres. On equal cells the positions for slicing are in cells, else in m from the
+    base.
 
     Parameters
     ----------
     true, x
-        The places in cells and, from the base, in m; components along the axis number `axes`.
+        The positions in cells and, from the base, in m; components along the axis number `axes`.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -240,7 +239,7 @@ def on_planes(
 
 
 def _in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return slices (d, d, m) that lie in a cell each, as edges are straight, in cells from the lower corner."""
+    """Return slices (d, d, m), each in one cell, with positions for slicing turned into cells from the lower corner."""
     if grid.even:
         return s
     out = s.copy()
@@ -257,15 +256,15 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     v = vertices(y)
     volume = simplex_volumes(v)
     flat = np.flatnonzero(~volume.any(axis=0))
-    if len(flat):  # thinner than that, and on a plane: nothing would be left of them
+    if len(flat):  # thinner than the snapping distance and on a plane: snapping would leave no volume
         in_cells[:, :, flat] = true[:, :, flat]
         y[:, :, flat] = x[:, :, flat]
         v = vertices(y)
         volume = simplex_volumes(v)
-    # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
+    # segments or triangles (d, d, m): vertices and coordinates first, for fast loops in numpy
     s = np.concatenate([v[facet] for facet in _FACETS[d][:, -1]], axis=2)
     outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), len(_FACETS[d]))
-    # a simplex that is turned inside out, in a domain about to fold, counts as positive: minus twice its volume
+    # an inverted simplex counts with positive volume: its negative volume is subtracted twice
     simplex, folded = np.nonzero(volume < 0)
     if len(folded):
         turned = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
@@ -277,12 +276,12 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
         s, facet = sliced(s, facet, axis, grid)
     s = _in_cells(grid, s)
     area = _area_vectors(s)
-    area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
+    area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has changed the order of vertices
     return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second)
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the normals (d, m) of segments or triangles (d, d, m), as long as these are large."""
+    """Return the normals (d, m) of segments or triangles (d, d, m); their length is the size."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.stack([e[0, 1], -e[0, 0]])
@@ -291,9 +290,9 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _facets(dim: int) -> NDArray[np.int64]:
-    """Return the vertices (k, d+1, d) of the facets of a domain's simplices, turned outward.
+    """Return the vertices (k, d+1, d) of the facets of a domain's simplices, oriented outward.
 
-    The k-th facet lacks the k-th vertex; the last ones, which lack the middle, are the domain's surface.
+    The k-th facet lacks the k-th vertex; the last facets, which lack the middle, are the domain's surface.
     """
     out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
     box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
@@ -306,7 +305,7 @@ def _facets(dim: int) -> NDArray[np.int64]:
 
 
 class _Slots:
-    """The cells that the bounding boxes of domains touch: a slot for each domain and cell, the last axis fastest."""
+    """Cells in the bounding boxes of domains: one slot for each domain and cell, with the last axis fastest."""
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
@@ -328,7 +327,7 @@ class _Slots:
         return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return the sums of the values of slots over the cells further along an axis in the same column."""
+        """Return the sums of the slots' values over the cells further along an axis in the same column."""
         out = np.zeros(self.size)
         for steps in range(1, int(self._span[axis].max(initial=1))):
             has = np.flatnonzero(self._place[axis] + steps < self._span[axis][self.point])
@@ -344,17 +343,17 @@ def _sum(
     owner: NDArray[np.int64],
     second: bool,
 ) -> Pieces:
-    """Sum the slices of the surfaces by (point, cell) into pieces."""
+    """Sum the slices of the surfaces by point and cell into pieces."""
     d = grid.dim
     index = np.floor(s.mean(axis=0))
     least = s.min(axis=0)
     most = s.max(axis=0)
     ends = []
     for a in range(d):
-        # what lies on a grid plane belongs to the cell of the body behind it
+        # a slice on a grid plane belongs to the cell of the body behind it
         index[a] -= (area[a] > 0) & (most[a] == index[a])
         np.clip(index[a], slots.low[a][owner], slots.high[a][owner], out=index[a])
-        flat = most[a] - least[a] < grid.snap[a]  # of two domains that touch, rounding may snap one only: hence twice
+        flat = most[a] - least[a] < grid.snap[a]  # rounding may snap one of two touching domains only: hence twice
         lower = np.flatnonzero(flat & (area[a] < 0) & (most[a] - index[a] < 2 * grid.snap[a]))
         upper = np.flatnonzero(flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * grid.snap[a]))
         ends.append((lower, upper))
@@ -363,7 +362,7 @@ def _sum(
     def total(values, chosen=slice(None)):
         return sum_by(slot[chosen], values[chosen], slots.size)
 
-    # integrals over the slices of (x, x^2/2, xy, xz) n_x from the cell's lower face, and of the columns beyond
+    # integrals over the slices of (x, x^2/2, xy, xz) n_x from the cell's lower face, and over the columns beyond
     x = s - index
 
     @cache
@@ -415,7 +414,7 @@ def _sum(
     middle = np.stack([m[kept] / volume for m in moments], axis=1)
     centroid = np.clip(middle, grid.snap, 1 - grid.snap)
     for (a, b), product in zip(pairs, uneven, strict=True):
-        # of a piece thinner than rounding allows for it is not known, and at most this
+        # rounding may spoil it for very thin pieces: clip to its exact range
         mean = np.clip(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25, 0.25)
         spread[:, a, b] = spread[:, b, a] = mean * h[a] * h[b]
     mixed = (
@@ -436,20 +435,20 @@ def _sum(
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return second moments (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
+    """Return second moments over volume (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
 
-    rings: whether they are rings, with sections that are parallelograms.
+    rings: whether the domains are sections of rings, in axisymmetry.
     """
     E = edges(corners)
-    out = E @ E.swapaxes(1, 2) / 12  # of a unit length, exact
+    out = E @ E.swapaxes(1, 2) / 12  # 1/12: second moment of a unit length, exact
     return of_rings(out, centroids(corners)[:, 0]) if rings else out
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return second moments (n, 2, 2), m^2, of rings about their centroids from those of symmetric sections.
+    """Return second moments over volume (n, 2, 2), m^2, of rings about their centroids, from symmetric sections.
 
-    spread (n, 2, 2), m^2, radius (n,), m: of the sections, about their centroids; these lie spread[:, 0] / radius
-    inside of those of the rings.
+    spread (n, 2, 2), m^2, and radius (n,), m, belong to the sections and their centroids; spread[:, 0] / radius is the
+    vector from there to the centroid of the ring.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -463,7 +462,7 @@ def _rings(
     cell (m, 2): indices; c (m, 2): centroids in the plane, from 0 to 1; squares, products (m,): means of r^2 and r z.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
-    squares = np.clip(squares, x**2, x)  # of slivers little is left in rounding
+    squares = np.clip(squares, x**2, x)  # slivers may lose them in rounding
     products = np.clip(products, np.maximum(0.0, x + z - 1), np.minimum(x, z))
     inner = grid.low[0] + h * cell[:, 0] if grid.even else grid.lines[0][cell[:, 0]]
     radius = inner + h * x
@@ -489,9 +488,10 @@ def _products(
     pairs
         Axes of the coordinates, ascending.
     x, sums, area
-        Vertices (d, d, m) of slices, their sums (d, m), and the area of the slices that the first axis sees (m,).
+        Vertices (d, d, m) of slices, their sums (d, m), and the areas (m,) of the slices, projected along the first
+        axis.
     pair, total
-        Sums products of two coordinates over the vertices of slices, and values of slices over slots.
+        Functions that sum products of two coordinates over the vertices of slices, and values of slices over slots.
     """
     d = len(x)
 
@@ -519,22 +519,22 @@ def _products(
 def cut_faces(
     grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cut faces of domains by the grid; return points of integration, exact for what Q1 makes of a face in a cell.
+    """Cut faces of domains by the grid; return integration points, exact for products of Q1 functions.
 
-    A force on a face that crosses a grid line belongs to the nodes on both sides by what lies there: with one
-    point a face, what is left over moves nodes of partly filled cells in every step, for ever.
+    A face that crosses a grid line must load the nodes on both sides in proportion to its parts. With one point a face,
+    the error moves nodes of partly filled cells in every step, without end.
 
     Parameters
     ----------
     corners : (m, 2^(d-1), d), m
-        Corners of the faces, of a triangle the last one twice.
+        Corners of the faces; triangles repeat the last one.
     local : (m, 2^(d-1), e)
-        Coordinates of the corners to be interpolated.
+        Coordinates of the corners for interpolation.
 
     Returns
     -------
-    Of each point: its face, its position (n, d), its local coordinates (n, e), its share of the face; and the
-    middle (n, d) of the part of the face in one cell that it belongs to.
+    Of each point: its face, position (n, d), local coordinates (n, e), and fraction of the face; and the middle (n, d)
+    of the part of the face in its cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -545,23 +545,23 @@ def cut_faces(
         both, split = np.concatenate([both, np.where(three, both[2], both.sum(axis=0) / 4)[None]]), ABOUT_MIDDLE
     whole = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
     count = whole.shape[2]
-    # the local coordinates tell sizes: those of a face are never degenerate, but a triangle is half of it
+    # sizes follow from local coordinates, which are never degenerate; a triangle is half of a face
     size = _size(whole[:, d:]).reshape(len(split), m)
     share = (size / size.sum(axis=0)).ravel()
-    s = np.concatenate([whole, np.repeat(np.eye(d)[:, :, None], count, axis=2)], axis=1)  # shares of the corners, too
+    s = np.concatenate([whole, np.repeat(np.eye(d)[:, :, None], count, axis=2)], axis=1)  # and barycentric coordinates
     owner = np.arange(count)
     for axis in range(d):
         s, owner = sliced(s, owner, axis, grid)
-    kept = np.flatnonzero(_size(s[:, -d:-1]) * share[owner] > SLIVER)  # what only touches a plane leaves nothing
+    kept = np.flatnonzero(_size(s[:, -d:-1]) * share[owner] > SLIVER)  # drop slices that only touch a plane
     s, owner = s[:, :, kept], owner[kept]
     if d == 3:
         s, owner = _polygons(grid, s, owner)
     share = _size(s[:, -d:-1]) * share[owner]
     s, owner = s[:, :-d], owner % max(1, m)
-    share /= sum_by(owner, share, m)[owner]  # with slivers of its parts nothing of a face is lost
+    share /= sum_by(owner, share, m)[owner]  # dropped slivers must not reduce a face
 
     def place(y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return places (n, d), m, from the base."""
+        """Return positions (n, d), m, from the base."""
         return grid.low + grid.h * y if grid.even else y
 
     points = np.einsum("qk,kam->qam", _RULES[d], s)
@@ -575,16 +575,16 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the parts of cut triangles as triangles that do not tell which axis was cut first.
+    """Return the parts of cut triangles as triangles that do not depend on the order of the axes.
 
-    The slices of a triangle in one cell are a convex polygon.  It is split about the mean of its corners.
+    The slices of a triangle in one cell form a convex polygon. It is split about the mean of its corners.
 
     Parameters
     ----------
     s : (3, a, n)
-        Corners of the slices: places as edges are straight first, and last their shares of the corners of the triangle.
+        Corners of the slices: positions for slicing first, and last their barycentric coordinates in the triangle.
     owner : (n,)
-        Triangles that these are slices of.
+        Triangle of each slice.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
@@ -593,7 +593,7 @@ def _polygons(
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
-    two = slice(-3, -1)  # shares of two corners, from which areas count
+    two = slice(-3, -1)  # two barycentric coordinates, which give areas
     middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
     order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
     v, group = v[:, order], group[order]
@@ -621,7 +621,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the next member (n,) of each group, of the last the first; groups (n,) in order."""
+    """Return the next member (n,) of each group, cyclically; groups (n,) are in order."""
     after, starts = np.arange(1, len(group) + 1), np.flatnonzero(np.diff(group, prepend=-1))
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
@@ -632,19 +632,19 @@ def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.sqrt((e[0] ** 2).sum(axis=0))
-    a, b = e  # no determinant of a . b, in which thin triangles drown
+    a, b = e  # a determinant of a . b would lose thin triangles in rounding
     return np.sqrt(sum((a[i] * b[j] - a[j] * b[i]) ** 2 for i, j in combinations(range(len(a)), 2)))
 
 
 _CUBIC = (0.659027622374092, 0.231933368553031, 0.109039009072877)  # Source: Strang and Fix (1973)
-_RULES = {  # Source: Gauss, Strang and Fix (1973); of equal weight, exact to third order
+_RULES = {  # Source: Gauss, Strang and Fix (1973); equal weights, exact to third order
     2: 0.5 + np.array([[1, -1], [-1, 1]]) / np.sqrt(12),
     3: np.array(list(permutations(_CUBIC))),
 }
 
 
 def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
-    """Slice simplices, as edges are straight, by the grid planes of an axis until none crosses a plane."""
+    """Slice simplices, in positions for slicing, by the grid planes of an axis until none crosses a plane."""
     done_s, done_owner = [], []
     while True:
         t = s[:, axis]
@@ -687,7 +687,7 @@ def cut_at(s, owner, axis: int, plane):
 
 
 def _on_plane(a, b, axis: int, plane):
-    """Return the points where the edges from a to b meet the plane, exactly on it."""
+    """Return the intersections of the edges from a to b with the plane, exactly on it."""
     t = (plane - a[axis]) / (b[axis] - a[axis])
     x = a + t * (b - a)
     x[axis] = plane

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Values at places, by polynomials that are fitted to what is known around them: moving least squares.
+"""Values at given positions from polynomials fitted to data around them: moving least squares.
 
-    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i the offsets from the place,
+    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i the offsets from the position.
 
-whose constant is the value there (Lancaster and Salkauskas 1981).  Polynomials up to the degree are exact.  The weights
-fall smoothly to nothing, so values change steadily as data come and go.  Where the data do not tell a coefficient it
-is none: the small terms see to it, the higher degrees first.
+The constant of P is the value (Lancaster and Salkauskas 1981). Polynomials up to the degree are reproduced exactly. The
+weights fall smoothly to zero, so values are continuous as data enter and leave. The small terms set coefficients to
+zero that the data do not determine, the higher degrees first.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 RADIUS = 3.0
-"""Offsets, over the spacing of the data, from which on these have no weight.
+"""Offset, over the spacing of the data, from which on the weight is zero.
 
-Source: exact, at an end of the data those at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
+Source: exact, at an end of the data the points at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of the coefficients of each degree, over those of the data: of what these do not tell.
+"""Weights of the coefficients of each degree relative to the data: they matter only for undetermined coefficients.
 
 A hundredth and a hundred times as much change pressures of a consolidating column by 1e-5 of the load.
 """
 
 
 def near(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights (r,) of data at offsets (r, d) over their spacing."""
+    """Return the weights (r,) of data at offsets (r, d), in units of their spacing."""
     return np.clip(1 - (offset / RADIUS) ** 2, 0, None).prod(axis=1) ** 4
 
 
 class LocalFit:
-    """Polynomials about some places, fitted to values that all processes add.
+    """Polynomials about given positions, fitted to the values of all processes.
 
     Parameters
     ----------
     count
-        Number of places.
+        Number of positions.
     dim
         Number d of coordinates.
     degree
-        Of the polynomials, 1 or 2.
+        Degree of the polynomials, 1 or 2.
     width
-        Number of values at each place.
+        Number of values at each position.
     """
 
     def __init__(self, count: int, dim: int, degree: int, width: int = 1):
@@ -58,7 +58,7 @@ class LocalFit:
         self._sums, self._shape = np.zeros((count, size * (size + width))), (count, size, size + width)
 
     def add(self, at: NDArray[np.int64], offset: NDArray, values: NDArray, weight: NDArray) -> None:
-        """Add values (r, width), with weights, for places `at` (r,), at offsets (r, d) over the spacing of the data."""
+        """Add weighted values (r, width) for positions `at` (r,), at offsets (r, d) in units of the data's spacing."""
         basis = np.stack([offset[:, list(p)].prod(axis=1) for p in self._powers], axis=1)
         rows = np.concatenate([basis, values], axis=1)
         outer = (weight[:, None] * basis)[:, :, None] * rows[:, None, :]
@@ -66,7 +66,7 @@ class LocalFit:
             self._sums[:, k] += sum_by(at, column, len(self._sums))
 
     def values(self, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the values (count, width) at the places, on every process; zero where nothing was added."""
+        """Return the values (count, width) at the positions, on every process; zero without data."""
         size = len(self._powers)
         sums = over_all(comm, self._sums).reshape(self._shape)
         A = sums[:, :, :size].copy()

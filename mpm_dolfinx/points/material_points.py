@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Material points: what a body remembers while the grid is reset.
+"""Material points: the state that a body keeps when the grid is reset.
 
-Places, corners of their domains, F, pore pressure; and `data` by name: states of laws, what they keep of conditions,
-and of bodies with inertia the velocity and the rate of F, which `inertia` carries from step to step.
+It has positions, corners of the particle domains, F, pore pressure, and `data` by name: state variables of laws, data
+of conditions and, with inertia, velocity and rate of F.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import centroids
 
 ACROSS = "stretch across"
-"""Name of what points of plane strain carry whose laws see a stretch across the plane, that of a mean dilatation."""
+"""Name of the out-of-plane stretch of points in plane strain, for laws with F-bar along all three axes."""
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the body (n,) of each point by its number; starts (bodies + 1,): first numbers of bodies, and of none.
+    """Return the body (n,) of each point by its id; starts (bodies + 1,): first id of each body, and of new points.
 
-    Points beyond those as seeded are of one body after the other.
+    Ids beyond the seeded ones are assigned to the bodies in turn.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, np.searchsorted(starts, ids, side="right") - 1, beyond % max(1, len(starts) - 1))
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F (n,) of (n, d, d); numpy's own, by factors, takes twenty times as long."""
+    """Return det F (n,) of (n, d, d); numpy's own, by LU factors, takes twenty times as long."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
@@ -49,13 +49,13 @@ def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return F (n, d, d), scaled to volume ratios J (n,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # of what is turned inside out, which is refused afterwards
+    with np.errstate(divide="ignore", invalid="ignore"):  # inverted points are refused later
         ratio = J / determinant(F)
     return F * (np.sign(ratio) * np.abs(ratio) ** (1 / F.shape[1]))[:, None, None]
 
 
 def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3) of its part in the plane (n, 2, 2), scaled to det F, and the stretch across the plane (n,)."""
+    """Return F (n, 3, 3) from its scaled in-plane part (n, 2, 2), with det F, and the out-of-plane stretch (n,)."""
     out = np.zeros((len(F), 3, 3))
     out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
     out[:, 2, 2] = across
@@ -63,13 +63,13 @@ def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.
 
 
 def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `in_space` takes of F (n, 3, 3)."""
+    """Return the scaled in-plane part and the out-of-plane stretch of F (n, 3, 3): the inverse of `in_space`."""
     across = F[:, 2, 2]
     return F[:, :2, :2] * np.sqrt(across)[:, None, None], across.copy()
 
 
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F F^-T (n, d, d) of (n, d, d), a tenth of the time of numpy's own inverse."""
+    """Return det F F^-T (n, d, d) of (n, d, d), in a tenth of the time of numpy's inverse."""
     if F.shape[1] == 2:
         flat = F.reshape(-1, 4)[:, [3, 2, 1, 0]] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
@@ -78,33 +78,33 @@ def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MaterialPoints:
-    """Material points of this process; arrays over its n points, that nobody changes.
+    """Material points of this process; immutable arrays over its n points.
 
-    Places of a state count from the grid's `base`; those of `Simulation.points` are true.
+    Positions in a state are relative to the grid's `base`; `Simulation.points` has true positions.
 
     Attributes
     ----------
     id : (n,)
-        Number of the point in the body.
+        Number of the point, in a scene unique over all bodies.
     corners : (n, 2^d, d), m
-        Tracked corners of the point's domain, in the order of `cutting.corner_bits`.
+        Tracked corners of the particle domain, in the order of `cutting.corner_bits`.
     F : (n, d, d)
-        Deformation gradient; where laws see a stretch across the plane its part in the plane, scaled to det F.
+        Deformation gradient; with an out-of-plane stretch its in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: the mean over the domain, of second order; what cells and
-        domains take along is the state's.
+        Pore pressure, positive in compression: the mean over the domain, of second order. Cells and pieces have their
+        own.
     x : (n, d), m
-        Centroid of the domain, in axisymmetry in the plane: there F and pressure are those of linear fields.
+        Centroid of the domain, in axisymmetry of its section: F and pressure of linear fields are exact there.
     origin : (n, 2^d, d), m
-        Corners from which displacements count: as seeded, or when a stage reset them.
+        Corners at zero displacement: as seeded, or at the last reset by a stage.
     reference : (n, 2^d, d), m
-        Corners of the domain at rest, from which F counts: as seeded, or as put on others.
+        Corners of the domain in the reference configuration of F: as seeded, or as re-initialised.
     data : name -> (n, ...)
-        What else the points carry: parameters that differ from point to point, state of the law.
+        Further data of the points: parameters that vary in space, state of the law.
     """
 
     id: NDArray[np.int64]
@@ -123,15 +123,15 @@ class MaterialPoints:
         for values in self.arrays:
             values.flags.writeable = False
 
-    def __reduce__(self):  # a read-only mapping cannot be sent to other processes
+    def __reduce__(self):  # a read-only mapping cannot be pickled
         return type(self), (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
 
     def placed(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with true places, which counted from a base (d,), m: `PlacedPoints`, but for base 0."""
+        """Return the points with true positions, from positions relative to a base (d,), m; base 0 returns `self`."""
         return PlacedPoints(**self._moved(base)) if base.any() else self
 
     def _moved(self, by: NDArray[np.float64]) -> dict[str, Any]:
-        """Return the fields with all places moved by (d,), m."""
+        """Return the fields with all positions moved by (d,), m."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         corners, x = self.corners + by, self.x + by
 
@@ -141,7 +141,7 @@ class MaterialPoints:
         return own | {"corners": corners, "x": x, "origin": of(self.origin), "reference": of(self.reference)}
 
     def __repr__(self) -> str:
-        """Return one line: how many points, their volume at rest, and the ranges of J and pressure."""
+        """Return one line: number of points, their reference volume, and the ranges of J and pressure."""
         own = [f"{len(self)} points in {self.F.shape[1]}D"]
         if len(self):
             own.append(f"{self.volume0.sum():.4g} m^{self.F.shape[1]} at rest")
@@ -164,11 +164,11 @@ class MaterialPoints:
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:
-        """Deformation gradient that laws see (n, 3, 3), in plane strain without a stretch across it (n, 2, 2)."""
+        """Deformation gradient of the laws (n, 3, 3); in plane strain without an out-of-plane stretch (n, 2, 2)."""
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
     def strained(self, F: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with another deformation gradient, of the shape that laws see."""
+        """Return the points with another deformation gradient, of the shape of `F_of_laws`."""
         if ACROSS not in self.data:
             return replace(self, F=F)
         F, across = in_plane(F)
@@ -176,13 +176,13 @@ class MaterialPoints:
 
     @property
     def displacement(self) -> NDArray[np.float64]:
-        """Displacement (n, d), m, of the centroids, from where displacements count."""
+        """Displacement (n, d), m, of the centroids since the start, or since the last reset by a stage."""
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
         """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer.
 
-        Arrays that are one stay one.
+        Fields that share an array still share one.
         """
         made: dict[int, NDArray] = {}
 
@@ -195,7 +195,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points in some rows (n,), and in the others another state of the same points."""
+        """Return these points in the rows (n,) that are true, and in the others another state of the same points."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -211,7 +211,7 @@ class MaterialPoints:
         return type(self)(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
-        """Return the points of these ids, or all others."""
+        """Return the points with these ids; with `kept` false, all other points."""
         rows = np.isin(self.id, ids) == kept
         return self if rows.all() else self.map(lambda values: values[rows])
 
@@ -219,18 +219,18 @@ class MaterialPoints:
         """Return the points of this process after every point went to its destination, ordered by id."""
         arrays = self.arrays
         one = tuple([values is other for other in arrays].index(True) for values in arrays)
-        alike = len(set(exchange.comm.allgather(one))) == 1  # else processes would wait for transfers of the others
+        alike = len(set(exchange.comm.allgather(one))) == 1  # else processes make different numbers of transfers
         received = (self if alike else self._apart()).map(exchange.send)
         order = np.argsort(received.id)
         return received.map(lambda rows: rows[order])
 
     def _apart(self) -> MaterialPoints:
-        """Return the points with an array of its own for each of their fields."""
+        """Return the points with a separate array for each of their fields."""
         arrays = {f.name: getattr(self, f.name).copy() for f in fields(self) if f.name != "data"}
         return type(self)(**arrays, data={name: values.copy() for name, values in self.data.items()})
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
+        """Return the indices in `ids` of points of this process, and the indices of these points."""
         at = np.searchsorted(self.id, ids)
         here = np.flatnonzero((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)) if len(self) else []
         here = np.asarray(here, dtype=np.int64)
@@ -238,8 +238,8 @@ class MaterialPoints:
 
 
 class PlacedPoints(MaterialPoints):
-    """Material points with true places, which do not count from the grid's `base`: no `State` takes them."""
+    """Material points with true positions, not relative to the grid's `base`; a `State` does not accept them."""
 
     def from_base(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with places that count from a base (d,), m, as those of a state."""
+        """Return the points with positions relative to a base (d,), m, as in a state."""
         return MaterialPoints(**self._moved(-base))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of the bodies that hang together: no force and no fluid goes from one to another."""
+"""Connected parts of the bodies: neither forces nor fluid pass from one part to another."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Parts of the bodies on the grid.
+    """Connected parts of the bodies on the grid.
 
-    count: how many there are; cells, nodes : (cells,), (nodes,) part of each active local cell and node, from 0, else
-    -1.
+    count: number of parts; cells, nodes : (cells,), (nodes,) part of each active local cell and node, from 0, else -1.
     """
 
     count: int
@@ -34,7 +33,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a vector of this process, each of a part.
+    """Entries of a vector on this process, each with its part.
 
     Parameters
     ----------
@@ -61,23 +60,24 @@ class OfParts:
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
-        """Numbers (count,) of entries of each part."""
+        """Number (count,) of entries of each part."""
         return self.sums(np.ones(len(self.of)))
 
 
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return norms / scales; 0 where the norm is round-off, never nan, which no comparison would notice."""
+    """Return norms / scales; 0 where the norm is round-off, and inf in place of nan, so that comparisons notice it."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         ratio = np.where((scales > 0) & (norms < np.inf), norms / scales, np.inf)
     return np.where(norms <= round_off, 0.0, ratio)
 
 
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    """Return the part (cells,), from 1, that each active local cell belongs to by common nodes, and how many there are.
+    """Return the connected part (cells,), from 1, of each active local cell, and the number of parts.
 
-    Cells that are not active have 0.  Parts are numbered by their first cells, alike on any number of processes.
+    Cells with common nodes belong to one part; inactive cells have 0. The order of the first cells numbers the parts,
+    alike on any number of processes.
     """
     cells, out = np.flatnonzero(active), np.zeros(len(active), dtype=np.int64)
     nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
@@ -95,7 +95,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the part of each row, from 0, that common columns make, and how many there are; no row is empty."""
+    """Return the connected component of each row, from 0, by common columns, and their number; no row is empty."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows), dtype=np.int8), (rows, shape[0] + columns)), shape=(n, n))
     count, part = connected_components(pairs, directed=False)
@@ -105,10 +105,10 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the parts of cells over all processes, and how many there are.
+    """Return the parts of cells over all processes, and their number.
 
-    own, count: part of each cell on this process, and how many there are; nodes, of_node (n,): local numbers of their
-    nodes, and the part that each belongs to.
+    own, count: part of each cell on this process, and number of these parts; nodes, of_node (n,): local numbers of the
+    nodes of the cells, and the part of each node.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])
@@ -119,7 +119,7 @@ def _over_processes(
         shared |= grid.owner(cell) != grid.comm.rank
     number = np.ravel_multi_index(tuple(index[shared].T), tuple(grid.shape + 1)) + copy[shared, 0] * grid.nodes
     pairs = np.concatenate(grid.comm.allgather(np.stack([start + of_node[shared], number], axis=1)))
-    # each part also has a column of its own
+    # an extra column for each part
     columns, at = np.unique(pairs[:, 1], return_inverse=True)
     rows = np.concatenate([pairs[:, 0], np.arange(sum(counts))])
     at = np.concatenate([at.ravel(), len(columns) + np.arange(sum(counts))])

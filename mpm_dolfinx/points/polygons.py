@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Convex polygons in the plane, many at a time: cut by lines, and divided into quadrilaterals."""
+"""Many convex polygons in the plane: cut by lines, and divided into quadrilaterals."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 NONE = -1
-"""Number of an edge that has none."""
+"""Number of an edge without a number."""
 
 
 @dataclass(frozen=True)
 class Polygons:
     """Polygons (n,) of up to k vertices, anti-clockwise.
 
-    x : (n, k, 2), m, vertices, the last one repeated; count : (n,) how many they are; edge : (n, k) number of the edge
-    from each vertex to the next, by which it is known after cuts.
+    x : (n, k, 2), m, vertices, the last one repeated; count : (n,) number of vertices; edge : (n, k) number of the edge
+    from each vertex to the next, which cuts preserve.
     """
 
     x: NDArray[np.float64]
@@ -26,17 +26,17 @@ class Polygons:
 
     @classmethod
     def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:
-        """Return polygons that all have k vertices x (n, k, 2); without numbers (n, k) edges have none."""
+        """Return polygons with k vertices each, x (n, k, 2); by default their edges (n, k) have no numbers."""
         n, k = x.shape[:2]
         return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
 
     def of(self, rows: NDArray) -> Polygons:
-        """Return some of the polygons."""
+        """Return the polygons `rows`."""
         return Polygons(self.x[rows], self.count[rows], self.edge[rows])
 
     @property
     def after(self) -> NDArray[np.float64]:
-        """The next vertex (n, k, 2), m, after each."""
+        """The next vertex (n, k, 2), m, after each vertex."""
         last = np.arange(self.x.shape[1]) == self.count[:, None] - 1
         return np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
 
@@ -47,7 +47,7 @@ class Polygons:
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2), m, of polygons of some area; of others a vertex."""
+        """Centroids (n, 2), m; a vertex of polygons without area."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])
@@ -61,9 +61,9 @@ class Polygons:
         return twice.sum(axis=1) / 2, np.einsum("nk,nki->ni", twice, y + after) / 6
 
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
-        """Return what of each polygon has normal . x <= level; normal (n, 2), level (n,).
+        """Return the part of each polygon with normal . x <= level; normal (n, 2), level (n,).
 
-        By Sutherland and Hodgman (1974).  A new edge has no number.
+        The algorithm is that of Sutherland and Hodgman (1974). A new edge has no number.
         """
         n, k = self.edge.shape
         here = np.arange(k) < self.count[:, None]
@@ -80,7 +80,7 @@ class Polygons:
         return _packed(x, edge, kept)
 
     def within(self, others: NDArray[np.float64]) -> Polygons:
-        """Return what of each polygon lies in another one, convex and anti-clockwise, with vertices (n, m, 2)."""
+        """Return the intersection of each polygon with a convex, anti-clockwise one with vertices (n, m, 2)."""
         out = self
         for k in range(others.shape[1]):
             way = others[:, (k + 1) % others.shape[1]] - others[:, k]
@@ -89,7 +89,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices that lie as near, m, to the one before."""
+        """Return the polygons without vertices whose next vertex is within the distance `near`, m."""
         k = self.edge.shape[1]
         here = np.arange(k) < self.count[:, None]
         return _packed(self.x, self.edge, here & (np.abs(self.after - self.x).max(axis=2) > near))
@@ -99,8 +99,7 @@ class Polygons:
 
         Returns
         -------
-        The polygon (m,) each is of; its vertices (m, 4, 2), of a triangle the last one twice; numbers (m, 4) of its
-        edges.
+        The polygon (m,) of each; its vertices (m, 4, 2), of a triangle the last one twice; numbers (m, 4) of its edges.
         """
         found = []
         for k in range(0, max(0, int(self.count.max(initial=0)) - 2), 2):
@@ -120,7 +119,7 @@ class Polygons:
 
 
 def _packed(x: NDArray[np.float64], edge: NDArray[np.int64], kept: NDArray[np.bool_]) -> Polygons:
-    """Return polygons of those vertices (n, k) that are kept."""
+    """Return polygons with the vertices (n, k) in `kept` only."""
     count = kept.sum(axis=1)
     most = max(1, int(count.max(initial=0)))
     order = np.argsort(~kept, axis=1, kind="stable")[:, :most]

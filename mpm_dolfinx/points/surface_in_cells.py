@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface of bodies in the plane in single cells, and quadrilaterals that fill what lies behind it."""
+"""The surface of bodies in single cells of the plane, and quadrilaterals that fill the body behind it."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
-"""Edges that the surface of a body has in a cell that is filled anew.
+"""Number of surface edges in a cell with renewed domains.
 
 Plateau (flow): halved 1.6e-03, doubled 1.5e-03, cells 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
-"""Cells by which the surface turns at a corner; what bends less is divided evenly.
+"""Deviation of the surface from a chord, in cells, that counts as a corner; flatter parts are divided evenly.
 
-Source: exact, a chord of one cell in a circle of a cell's radius: the grid sees no smaller one.
+Source: exact, a chord of one cell in a circle of a cell's radius: the grid cannot resolve a smaller circle.
 """
 RING = np.array([0, 1, 3, 2])
-"""Corners of a domain, anti-clockwise."""
+"""Corners of a particle domain, anti-clockwise."""
 BOX = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
 """Corners of a cell (1, 4, 2), anti-clockwise."""
 _HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]]) / 2
 
 
 class Region:
-    """What the bodies fill of cells (n,) that the surface passes through once, in coordinates from 0 to 1.
+    """The filled part of cells (n,) that the surface crosses once, in coordinates from 0 to 1.
 
     Parameters
     ----------
     cells
         The cells.
     surface : (n, EDGES + 1, 2)
-        Vertices of the surface in them, from where it enters to where it leaves, with the body on its left.
+        Vertices of the surface in them, from entry to exit, with the body on the left.
     """
 
     def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):
         self.cells = cells
         edges = surface.shape[1] - 1
-        most = edges + 10  # with those of halves of its sides, and one more
-        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in halves of a side
+        most = edges + 10  # plus corners and midpoints of the cell's sides, and one more
+        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in half sides
         end = np.where(end <= start + NEAR, end + 8, end)
         first = np.floor(start + NEAR).astype(np.int64) + 1
         count = np.maximum(0, np.ceil(end - NEAR).astype(np.int64) - first)
@@ -55,7 +55,7 @@ class Region:
         after = np.where((np.arange(most) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x[:, :1])
         after = np.where((np.arange(most) < size[:, None])[:, :, None], after, x)
         length = np.linalg.norm(after - x, axis=2)[odd]
-        length[:, :edges] = 0.0  # not of the surface
+        length[:, :edges] = 0.0  # the surface is not divided
         at = length.argmax(axis=1)
         place = np.arange(most)[None]
         middle = (x[odd, at] + after[odd, at]) / 2
@@ -75,7 +75,7 @@ class Region:
         self.sound = (sees.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the areas of so many cells, from 0 to 1; of those without a region 1."""
+        """Return the filled area of each of `count` cells, from 0 to 1; 1 for cells without a region."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -83,7 +83,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return rows (m,) of this, corners (m, 4, 2) of the domains there, and which faces (m, 4) are the surface."""
+        """Return regions (m,), corners (m, 4, 2) of new domains in them, and the faces (m, 4) on the surface."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -108,7 +108,7 @@ def resampled(
 ) -> NDArray[np.float64]:
     """Return vertices (n, EDGES + 1, 2) of surfaces from P to Q (n, 2), evenly along their parts.
 
-    Their area beyond the chords, bulge (n,), stays what it is: vertices are shifted by what they would lose.
+    The area between surface and chord, bulge (n,), is preserved: vertices shift by the lost area.
 
     of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
     """
@@ -121,7 +121,7 @@ def resampled(
     at[:, 0], at[:, -1] = ends
 
     def divide(low: int, high: int) -> None:
-        """Put a vertex between two: at the sharpest corner, or in the middle of what is nearly straight."""
+        """Put a vertex between two others: at the sharpest corner, or in the middle of a nearly straight part."""
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
         off = x[:, 0] - a[of]
@@ -154,7 +154,7 @@ def resampled(
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where places (n, 2) on the border of the unit square lie, anti-clockwise, from 0 to 4."""
+    """Return anti-clockwise coordinates, from 0 to 4, of positions (n, 2) on the border of the unit square."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)

@@ -303,7 +303,9 @@ class Retentions:
         row = points.retention
         if "lever" in points.sizes:
             p = p + ufl.dot(self.weight, points.lever)
-        values = [_property(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first]
+        values = [
+            property_of(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first
+        ]
         out = values.pop(0) if self._everywhere else 1.0
         first = 2 if self._everywhere else 1
         for number, value in enumerate(values, first):
@@ -324,8 +326,8 @@ def _lifted(law, values: Sequence):
     return out
 
 
-def _property(law, name: str, p):
-    """Return a property of a law at pressures p, Pa, as UFL."""
+def property_of(law, name: str, p):
+    """Return a property of a law at pressures p, Pa, as UFL: see `Retentions.of`."""
     if name == "bishop" and not hasattr(law, "bishop"):
         name = "saturation"
     return _called(law, name, p)
@@ -453,3 +455,37 @@ def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the pressures (n,), Pa, of such logarithms (n,)."""
     return np.where(y < 0, scale * np.sinh(y), scale * y)
+
+
+FARTHEST = np.log(10)
+"""Change of the logarithm of the suction in a Newton step, at most; without one dry soil beside wet finds no solution.
+
+Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
+
+Plateau (dry): halved 7.6e-10, doubled 9.8e-10, cells 6.6e-03.
+"""
+
+
+def restrained(
+    p: NDArray[np.float64], dp: NDArray[np.float64], scale: NDArray[np.float64] | float
+) -> NDArray[np.float64]:
+    """Return by how much pressures p (n,) are to fall, Pa, where Newton's method asks for falls dp (n,).
+
+    Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for the
+    saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  The logarithm of the suction
+    changes by at most `FARTHEST`.
+
+    Parameters
+    ----------
+    p, dp : (n,), Pa
+        Pressures, and falls that are asked for.
+    scale : (n,), Pa
+        Suction about which pores drain.
+    """
+    there, turn = p - dp, -scale
+    there = np.where((p - turn) * (there - turn) < 0, turn, there)
+    here, y = logarithm(p, scale), logarithm(there, scale)
+    far = (np.abs(y - here) > FARTHEST) & (np.minimum(here, y) < 0)
+    y = here + np.clip(y - here, -FARTHEST, FARTHEST)
+    there = np.where(far, pressure_at(y, scale), there)
+    return np.where(there == p - dp, dp, p - there)

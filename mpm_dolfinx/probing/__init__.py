@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Fields at points, cells and probes."""
+"""Results at points, cells and probes."""

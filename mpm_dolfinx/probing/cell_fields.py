@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the cells of the grid hold at present: centroids, displacements, pressures, stresses."""
+"""Present fields of the cells: centroids, displacements, pressures, stresses."""
 
 from __future__ import annotations
 
@@ -16,28 +16,27 @@ from mpm_dolfinx.stepping.state import State
 
 @dataclass(frozen=True)
 class CellFields:
-    """Fields of this process's cells that hold something; arrays over n cells.
+    """Fields of the non-empty cells of this process; arrays over n cells.
 
-    They are of the grid on which the next step begins, so all are of the present, and of the same second order as the
-    solution: at `x`, not at the cell's middle.  Means are by volume, over what the cell holds.
+    The fields refer to the present position of the grid for the next step.  They are second-order accurate at `x`, not
+    at the midpoint of the cell.  Means are volume averages over the content of the cell.
 
     Attributes
     ----------
     cell : (n,)
         Local number of the cell in the grid's mesh.
     x : (n, d), m
-        Centroid of what it holds.
+        Centroid of the content.
     volume : (n,), m^d
-        Of what it holds.
+        Volume of the content.
     displacement : (n, d), m
-        Mean since the start, or since a stage reset it.
+        Mean displacement since the start, or since a stage reset it.
     effective_stress, stress : (n, d, d), in axisymmetry (n, 3, 3), Pa
-        Mean Cauchy stress of the skeleton, and of skeleton and fluid together; tension is positive.
+        Mean effective and total Cauchy stress, tension positive.
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Fluid in the pores, as at zero pressure, less what their volumes have gained beyond what has come (`owed`); None
-        without fluid.
+        Volume of pore fluid at zero pressure, less the volume defect `owed` of the points; None without fluid.
     """
 
     cell: NDArray[np.int64]
@@ -51,17 +50,17 @@ class CellFields:
 
 
 def cell_fields(scene: Scene, state: State) -> CellFields:
-    """Return what the cells hold in a state; on all processes together."""
+    """Return the cell fields of a state; all processes call it together."""
     state = state if state.stays else state.at_owners(scene.grid)
     points = state.points
     scene.rests_at(state.stage, state.t)
-    on_grid = scene.on_grid(state.as_cut)  # the next step has use for it
+    on_grid = scene.on_grid(state.as_cut)  # cached for the next step
     cut, places = on_grid.cut, on_grid.data.pieces.places
     weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means in the cells of values (m, ...) at the pieces."""
+        """Return the means in the cells of values (m, ...) at the cut subdomains."""
         columns = values.reshape(len(values), -1).T
         sums = [sum_by(places.slots, weight * column, len(volume)) / volume for column in columns]
         return np.stack(sums, axis=1).reshape(len(volume), *values.shape[1:])

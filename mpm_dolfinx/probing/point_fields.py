@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What engineers ask of the material points: stresses in three dimensions, their invariants, porosities."""
+"""Fields of the material points: stresses in three dimensions, invariants, porosity, saturation."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ from mpm_dolfinx.stepping.scene import Scene
 
 @dataclass(frozen=True)
 class PointFields:
-    """Fields at this process's n material points; stresses are Cauchy's, tension is positive.
+    """Fields of the n material points of this process; Cauchy stresses, tension positive.
 
     Attributes
     ----------
     effective_stress, stress : (n, 3, 3), Pa
-        Of the skeleton, and of skeleton and fluid together.  In axisymmetry x is the radius, y the axis, and zz acts
-        along the hoops.  In plane strain zz acts across the plane; it is nan where
-        the law is one of the user's for the plane only, and so are the invariants.
+        Effective and total stress.  In axisymmetry x is the radius, y the axis and zz the hoop stress.  In plane strain
+        zz acts across the plane; zz and the invariants are nan for user laws that are defined in the plane only.
     mean_effective_stress : (n,), Pa
-        p' = -tr(effective stress) / 3: compression is positive.
+        p' = -tr(effective stress) / 3, positive in compression.
     deviatoric_stress : (n,), Pa
-        q = sqrt(3/2 s : s), s the deviator of the stress: |axial - radial| stress in a triaxial test.
+        q = sqrt(3/2 s : s) with the deviator s of the stress; |axial - radial| stress in a triaxial test.
     porosity : (n,)
         Present volume fraction of the pores, 1 - (1 - n_0) / J.
     saturation : (n,)
-        Share of the pores that is full of fluid; without fluid 0.
+        Degree of saturation of the pores; 0 without fluid.
     """
 
     effective_stress: NDArray[np.float64]
@@ -41,7 +40,7 @@ class PointFields:
 
 
 def point_fields(scene: Scene, points: MaterialPoints) -> PointFields:
-    """Return the fields of some points; on all processes together."""
+    """Return the fields of some points; all processes call it together."""
     materials, effective = scene.materials, scene.materials.effective_stress_3d(points)
     pore = materials.felt(points)
     mean = np.trace(effective, axis1=1, axis2=2) / 3

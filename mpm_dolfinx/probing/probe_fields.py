@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Pressures and stresses at probes, at their places: fitted to cells and points around them (`LocalFit`).
+"""Pore pressure and stress at probes, by a weighted fit to surrounding cells and points (`LocalFit`).
 
-Cells count that lie on a way to the probe through open faces, up to three away along each axis, and hold nothing but
-what conducts and deforms as the probe's own material.  Of others only the flux tells: the pressure that it has on the
-face between the two.  Pressures of drained sides count where these are, and the weight of the fluid is taken out, so
-water at rest is exact.  No value passes those of the cells beside the probe's, of drained sides of its cell, or up to
-other sides what the slope of the cells before has there.
+A cell takes part if open faces connect it to the probe's cell and it lies within three cells along each axis.  It must
+contain only soil with the conductivity and stiffness of the probe's soil.  At faces to other cells the fit takes the
+face pressure of the two-point flux, and on drained sides the prescribed pressure.  Heads are fitted instead of
+pressures, so hydrostatic states are exact.  The result is limited by the heads of the probe's cell, its neighbours and
+the drained sides in it.  Towards an undrained side the limit is extrapolated with the slope of the adjacent cells.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 REACH = int(RADIUS)
-"""Cells along each axis from that of a probe to the last one that counts: all that `LocalFit` gives weight."""
+"""Cells along each axis from a probe's cell to the last one with a weight in `LocalFit`."""
 
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the pore pressures (m,), Pa, at the places of probes; on all processes together."""
+    """Return the pore pressures (m,), Pa, at probes; all processes call it together."""
     state = state if state.stays else state.at_owners(scene.grid)
-    on_grid = scene.on_grid(state.as_cut)  # the next step has use for it
+    on_grid = scene.on_grid(state.as_cut)  # cached for the next step
     gravity = state.stage.gravity_at(state.t)
     weight = np.zeros(scene.grid.dim) if gravity is None else scene.fluid.density * gravity
     return _Around(scene, state, on_grid, probes).pressures(weight)
 
 
 class _Lattice:
-    """The (2 REACH + 1)^d cells about those of probes, along the axes.
+    """Blocks of (2 REACH + 1)^d cells around the cells of m probes.
 
-    number (m, cells): lexicographic, -1 outside of the grid; midpoint, size (m, cells, d), m; middle: which is the
-    probe's own; stride (d,): from one to the next along each axis; beside: by axis and end, which cells have one there,
-    and it.
+    number (m, cells): lexicographic numbers, -1 outside the grid; midpoint, size (m, cells, d), m; middle: index of the
+    probe's cell in its block; stride (d,): index increment along each axis; beside: for each axis and end, the cells
+    that have a neighbour there, and these neighbours.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -70,10 +70,11 @@ class _Lattice:
 
 
 class _Around:
-    """What the cells around m probes hold, the same on every process.
+    """Data of the cells around m probes, equal on every process.
 
-    All (m, cells, ...): p, Pa; centroid (d,), m, from the probe; half: from the cell's midpoint; open (d, 2): shares of
-    faces; kappa, shift (d,): see `Mobility`; counts, reached: see `_connected`.
+    All are arrays (m, cells, ...): p, Pa; centroid (d,), m, from the probe; half (d,), m: centroid from the midpoint of
+    the cell; open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: see
+    `_connected`.
     """
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
@@ -103,11 +104,11 @@ class _Around:
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], alike: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Return the local numbers (m, cells) of the cells that this process owns, else -1, and what all hold.
+        """Return the local numbers (m, cells) of owned cells, -1 for others, and the data of all cells.
 
-        p: of the filled owned cells, Pa; alike: of pieces (k, 3), what those have in common that conduct and deform
-        alike.  The columns are one where a cell is filled, p, centroid, mobility, shift, `alike` or nan
-        where pieces differ, and open shares.
+        p: pressures of the filled owned cells, Pa; alike (k, 3): keys of conductivity, its law and material of the cut
+        subdomains.  Columns of the data: 1 for filled cells, p, centroid, mobility, shift, keys (nan if the subdomains
+        of a cell differ), open fractions.
         """
         grid = self._grid
         contents = self._contents
@@ -116,7 +117,7 @@ class _Around:
         mobility = on_grid.resting_mobility()
         slot = contents.slot(on_grid.cut.cells)
         held = np.zeros((len(filled), 3))
-        held[slot] = alike  # of any of the cell's pieces
+        held[slot] = alike  # of any cut subdomain in the cell
         held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (alike != held[slot]).T], axis=1)] = np.nan
         one = np.ones((len(filled), grid.dim))
         kappa = mobility.mean[:, None] * (one if mobility.share is None else mobility.share)
@@ -125,19 +126,19 @@ class _Around:
         rows = np.column_stack([one[:, 0], p, contents.centroid[filled], kappa, shift, held, share])
         local = np.where(number >= 0, grid.local(np.maximum(number, 0)), -1)
         local[local >= grid.num_owned] = -1
-        own = local >= 0  # a process may have no cell
+        own = local >= 0  # may be empty
         local[own] = np.where(on_grid.active[local[own]], local[own], -1)
         out, (probe, place) = np.zeros((*local.shape, rows.shape[1])), np.nonzero(local >= 0)
         out[probe, place] = rows[contents.slot(local[probe, place])]
         return local, over_all(grid.comm, out)
 
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which cells (m, cells) count, and which lie behind open faces of these or of the probe's.
+        """Return which cells (m, cells) take part in the fit, and which lie behind their or the probe's open faces.
 
-        Where none holds the probe's material alone, as in thin layers and where it changes from point to point, those
-        of its material's number count, else all.
+        If no cell contains only the probe's soil, as in thin layers or graded soil, cells of its material take part,
+        else all cells.
 
-        same: (m, cells, 3) where cells hold nothing but the probe's conductivity, law of it, and material.
+        same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """
         same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
@@ -154,18 +155,18 @@ class _Around:
         return reached & alike, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return between which cells, here and there by `_beside`, there is an open face (m, n)."""
+        """Return which pairs of neighbours (m, n) along an axis have an open face between them."""
         here, there = self._lattice.beside[axis, end]
         return (self._open[:, here, axis, end] > 0) & (self._open[:, there, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the probes; weight (d,), N/m^3: of the fluid."""
+        """Return the pressures (m,), Pa, at the probes; weight (d,), N/m^3: unit weight of the fluid."""
         comm = self._grid.comm
         head = self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
         rows = [(at, offset, value, share)]
-        if comm.rank == 0:  # what all know
+        if comm.rank == 0:  # data that all processes share
             probe, place = np.nonzero(self._counts)
             rows += [(probe, self._centroid[probe, place], head[probe, place], np.ones(len(probe)))]
             rows += self._beside_others(head)
@@ -183,7 +184,7 @@ class _Around:
         return np.clip(base + fit.values(comm)[:, 0], low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and largest head (m,), Pa, of the probe's cell, those beside it, and up to its surface."""
+        """Return limits (m,) of the head, Pa: from the probe's cell, its neighbours, and the slope towards a side."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
@@ -210,7 +211,7 @@ class _Around:
         return low, high
 
     def _beside_others(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return probes, offsets, heads and weights of faces between cells that count and others, by the flux there."""
+        """Return probes, offsets, heads and weights at faces to cells outside the fit, by the two-point flux."""
         out = []
         for (axis, end), pair in self._lattice.beside.items():
             here, there = pair
@@ -231,9 +232,9 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return probes, offsets, heads and weights of drained sides of cells that count, and which are of its own.
+        """Return probes, offsets, heads and weights of drained sides in the fit, and whether they cut the probe's cell.
 
-        A side counts once, by its middle: of several faces a fit would make slopes along it.
+        A side of a cell has one value at its centre, because values of several faces would create slopes along it.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))
@@ -255,6 +256,6 @@ class _Around:
 
 
 def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the effective stresses (m, 3, 3), Pa, at the places of probes; on all processes together."""
+    """Return the effective stresses (m, 3, 3), Pa, at probes; all processes call it together."""
     comm, sizes = scene.grid.comm, list(map(len, scene.bodies))
     return fitted_at(comm, sizes, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)

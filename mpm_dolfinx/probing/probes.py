@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Places in the bodies whose displacement, pressure and stress are wanted."""
+"""Probes: material particles with recorded displacement, pressure and stress."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """Tracked positions: material particles whose displacement is wanted; m of them.
+    """m tracked material particles.
 
-    x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it;
-    bodies: those of the scene that they are for; stressed: whether their stress is wanted too.
+    x0 (m, d): reference positions, m; id (m,): particle domain of each; xi (m, d): local coordinates in it; bodies:
+    bodies of the scene; stressed: whether stresses are recorded too.
     """
 
     x0: NDArray[np.float64]
@@ -36,14 +36,14 @@ class Probes:
     stressed: bool = False
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-        """Refuse, with a ValueError, a scene of other bodies, or one from which a probed body has gone."""
+        """Raise a ValueError for a scene with other bodies, or without a probed body."""
         if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
             raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
         body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
         gone = np.flatnonzero(~np.asarray(present)[body])
         if len(gone):
-            raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in one that is there now")
+            raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in a body that is present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, on every process."""
@@ -56,30 +56,30 @@ class Probes:
         return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
 
     def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (m, ...) on every process of those of the probes that are here."""
+        """Return values (m, ...) on every process, from the values of the probes on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[here] = values
         return over_all(comm, out)
 
 
 def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> None:
-    """Refuse, with a ValueError, probes whose domains have been renewed."""
+    """Raise a ValueError if renewal has replaced the domain of a probe."""
     found = np.zeros(len(probes.id))
     found[points.find(probes.id)[0]] = 1.0
     lost = np.flatnonzero(over_all(comm, found) == 0)
     if len(lost):
-        what = f"probe at {probes.x0[lost[0]]}: its domain has been renewed in a run without it"
+        what = f"probe at {probes.x0[lost[0]]}: its domain was renewed in a run without this probe"
         raise ValueError(f"{what}, must be given to all runs, or leave out Numerics(renewal=True)")
 
 
 def _same(a: Body, b: Body) -> bool:
-    """Whether two bodies have the same points."""
+    """Return whether two bodies have the same points."""
     alike = len(a) == len(b) and a.dim == b.dim
     return a is b or (alike and all(np.array_equal(a.lower_of(p), b.lower_of(p)) for p in in_chunks(len(a))))
 
 
 def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
-    """Return places where something is probed, as an array (m, d), m."""
+    """Return reference positions of probes as an array (m, d), m."""
     allowed = f"positions of {dim} finite coordinates"
     x = np.atleast_2d(numbers("probes: x0", x0, None, allowed=allowed))
     if x.shape[1:] != (dim,):
@@ -90,7 +90,7 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
     """Return probes: material particles that a run records, the `probes` of `Simulation.run`.
 
-    Recorded are displacement and position, with a fluid the pore pressure and, if asked for, the effective stress; see
+    A run records displacement and position, with fluid also the pore pressure, and the effective stress on request; see
     `Row`.
 
     Parameters
@@ -98,21 +98,21 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     bodies
         All bodies of the scene, in its order.
     x0 : (m, d), m
-        Reference positions, before a map, inside or on the surface of the bodies.  Where bodies touch, a position
-        belongs to the first of them: keep off by a little to have the other.
+        Reference positions, before a map, inside or on the surface of the bodies.  On a common surface of two bodies
+        the first one owns the probe; move the position slightly to select the other.
     stress
         Record the effective stress too.
 
     Raises
     ------
     ValueError
-        A position outside the bodies; from the run: other bodies than the scene's, or one that is not there now.
+        A position outside the bodies.  A run raises it for other bodies than the scene's, or an absent body.
     """
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)
     x0 = positions(x0, bodies[0].dim)
     ids, xi = np.empty(len(x0), dtype=np.int64), np.empty(x0.shape)
-    for i, x in enumerate(x0):  # a handful of positions, once a scene
+    for i, x in enumerate(x0):  # few positions, once for a scene
         found = next(_domains_at(bodies, x, rounding(x0)), None)
         if found is None:
             raise ValueError(f"probe at {x}: outside the bodies, must be in one or on its surface")
@@ -123,7 +123,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
 def _domains_at(
     bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield the points, in their order, whose domains hold a place x (d,), m, with its coordinates there."""
+    """Yield the points whose domains contain a position x (d,), m, in order, with its local coordinates."""
     start = 0
     for body in bodies:
         for part in in_chunks(len(body)):
@@ -137,13 +137,13 @@ def _domains_at(
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the coordinates (n, d), from -1 to 1, of a place x (d,), m, in each of some domains (n, 2^d, d), m."""
+    """Return the local coordinates (n, d), in [-1, 1], of a position x (d,), m, in domains (n, 2^d, d), m."""
     signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
-    for _ in range(20):  # Newton's method; of parallelepipeds the first step is exact
+    for _ in range(20):  # Newton's method; the first step is exact for parallelepipeds
         hats = 0.5 * (1 + signs * xi[:, None, :])
         dN = np.stack([0.5 * signs[:, a] * np.delete(hats, a, axis=2).prod(axis=2) for a in range(len(x))], axis=2)
         slope, off = np.einsum("nkd,nka->nda", corners, dN), x - interpolate(corners, xi)
-        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain there may be no place
+        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain a solution may not exist
         xi = np.clip(xi + step, -2.0, 2.0)
         if np.abs(step).max(initial=0.0) < ROUND_OFF:
             break

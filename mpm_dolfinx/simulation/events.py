@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Events that end a run: where in a step a function of the simulation changes its sign."""
+"""Events that end a run: zeros of functions of the simulation, located within a step."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Share of a step to which the time of an event is found.  Source: the documented accuracy of `until`."""
+"""Accuracy of the time of an event, relative to the step. Source: the documented accuracy of `until`."""
 
 Event = Callable[[Any], float]
-"""A number, or whether something is so, of the simulation."""
+"""A number or a truth value, as a function of the simulation."""
 
 
 class Simulated(Protocol):
@@ -33,11 +33,11 @@ class Simulated(Protocol):
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and what it took."""
+        """Return the state after a step of dt, s, and the report of the step."""
 
 
 class Step(NamedTuple):
-    """A step as it was taken: its start, its length, s, and its substeps, if not those of the scene."""
+    """A completed step: its start, its length, s, and its substeps if they differ from the scene's."""
 
     start: State
     dt: float
@@ -45,7 +45,7 @@ class Step(NamedTuple):
 
 
 class Found(NamedTuple):
-    """An event: which, how long the step to it is, s, its end, and what it took."""
+    """An event: its number, length of the step to it, s, state at its end, and report of the step."""
 
     number: int
     dt: float
@@ -59,14 +59,15 @@ class Events:
     Parameters
     ----------
     simulation
-        At the start of the run.
+        Simulation at the start of the run.
     until
-        Functions of the simulation, or one; numbers occur where their sign changes, truths where they turn true.
+        Functions of the simulation, or one. A number triggers an event where its sign changes, a truth value where it
+        turns true.
 
     Raises
     ------
     ValueError
-        What is no function, or gives no number, or not the same on all processes.
+        An entry is not a function, returns no number, or differs between processes.
     """
 
     def __init__(self, simulation: Simulated, until: Event | Sequence[Event] | None):
@@ -77,11 +78,11 @@ class Events:
             self._values()
 
     def within(self, step: Step, new: State) -> Found | None:
-        """Return the event that occurs first within a step with a new state; None where there is none.
+        """Return the first event within a step to the state `new`; None without an event.
 
-        Steps of other lengths are tried from the same start: by Brent's method for numbers, in halves for truths.  The
-        end is the first state found in which the event has occurred, `LOCATED` of the step after it at most.  The state
-        of the simulation is that at the start of the step afterwards, whatever is raised.
+        Trial steps of other lengths start from the same state: by Brent's method for numbers, by bisection for truth
+        values. The result is the first state after the event among them, at most `LOCATED` of the step after it. The
+        simulation is left in the state at the start of the step, even after an error.
         """
         if not self._until:
             return None
@@ -101,15 +102,15 @@ class Events:
                 if _crossed(before, tried[end])[k] and tried[end][k] != 0:
                     brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0.0, end, xtol=LOCATED * step.dt)
         except StepFailed as failed:
-            what = "until: the search for an event within a step of %.3g s has ended, for a shorter one failed: %s"
+            what = "until: the search for an event within a step of %.3g s stopped, because a shorter step failed: %s"
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
         end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
         self._simulation.state = step.start
-        new, report = self._simulation.advanced(end, *step.how)  # also where it was tried: what the scene holds is its
+        new, report = self._simulation.advanced(end, *step.how)  # even if tried before: the scene keeps data of it
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
-        """Return the values at the end of a step of another length, s, and keep them."""
+        """Return the values at the end of a step of another length, s, and keep them in `tried`."""
         if dt not in tried:
             self._simulation.state = step.start
             new, _ = self._simulation.advanced(dt, *step.how)
@@ -118,7 +119,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return what the functions give, a truth as 1 or -1; raise on all processes what is raised on one."""
+        """Return the values of the functions, truth values as 1 or -1; raise errors of one process on all."""
         comm = self._simulation.scene.grid.comm
         out = []
         error = None
@@ -139,13 +140,13 @@ class Events:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return which functions have other signs than at the start of a step; from zero none does."""
+    """Return the functions with another sign than at the start of a step; a zero at the start never counts."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 
 
 def _number(k: int, value) -> float:
-    """Return the value of a function as a number; a truth is 1 or -1."""
+    """Return the value of a function as a number; truth values are 1 or -1."""
     if isinstance(value, (bool, np.bool_)):
         return 1.0 if value else -1.0
     try:

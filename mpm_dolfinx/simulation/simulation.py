@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A scene and its state: what is given, how it goes on, and what may be asked of it."""
+"""A scene and its state: input, stages and steps, and results."""
 
 from __future__ import annotations
 
@@ -48,49 +48,49 @@ class Simulation:
     grid, bodies
         Background grid, and seeded bodies.
     materials
-        Material of each index that the bodies name.
+        Materials, by the indices in the bodies.
     walls
-        Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the components that
-        are zero there, such as {"left": "xy", "bottom": "y"}.
+        Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the displacement
+        components that they fix, such as {"left": "xy", "bottom": "y"}.
     conditions
-        What acts on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
-        `Inflow` on their sides, rigid `Tool`s, and `Contact`s of groups of bodies.  Other sides are free and sealed.
+        Conditions on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
+        `Inflow` on their sides, rigid `Tool`s, and `Contact`s of groups of bodies. Other sides are free and no-flow.
     fluid
-        Pore fluid; without it there is no storage problem.
+        Pore fluid; None for a dry scene, without the storage problem.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity; in axisymmetry along the axis.
     pressure
-        Pore pressure at the start, Pa, needs a fluid: a number, or a function of places x (n, d) as of `hydrostatic`.
+        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`; needs a fluid.
     initial_stress
-        Effective stress at the start, tension positive: `K0`, a function of places x (n, d) that gives normal stresses
-        (n, 3) or tensors (n, 3, 3), Pa, or one of these for each of some bodies, {index: ...}; of fills too, which
-        otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
-        so that a first step in which nothing changes moves nothing.
+        Initial effective stress, tension positive: `K0`, a function of positions x (n, d) that returns normal stresses
+        (n, 3) or tensors (n, 3, 3), Pa, or one of these for some bodies, {index: ...}. Fills start without stress
+        unless they are listed. The stress is balanced with the loads at the start, at the given pore pressures: nothing
+        moves in a first step under constant loads.
     terms
-        Terms of the user's own in UFL: functions for the balance of momentum, see `user_functions`, such functions on
-        a side, `OnSide`, and those for the storage of fluid, `Source`.
+        User-defined terms in UFL: functions for the balance of momentum, see `user_functions`, such functions on a
+        side, `OnSide`, and terms in the storage of fluid, `Source`.
     later
         Indices of bodies that a later stage adds, each once.
     numerics
-        Quadrature, coupling, tolerance and method of time integration, see `Numerics`.
+        Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        Whether bodies have inertia: then they need no walls.  With False they have none at first, and a later stage may
-        give it to them; with None no stage can.  Not with `quadrature="point"`.
+        True: bodies have inertia, and need no walls. False: quasi-static at first; a later stage may switch inertia on.
+        None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Velocity at the start of bodies that may have inertia, or a function of places; none is rest.
+        Initial velocity of bodies with inertia, or a function of position; by default zero.
 
     Attributes
     ----------
     state
-        All that the scene remembers between two steps (`State`): replaced as a whole, at the end of a step.  What
-        raises in between, Ctrl-C included, leaves it; the next `run` goes on from it.
+        The complete state between two steps (`State`). It is replaced as a whole at the end of a step. An error within
+        a step, Ctrl-C included, leaves it unchanged, and the next `run` continues from it.
     scene
         Grid, bodies and materials, with the compiled forms.
 
     Raises
     ------
     ValueError
-        Naming the object, its value and what is allowed.
+        Invalid input; the message names the object, its value and the allowed values.
     """
 
     def __init__(
@@ -140,13 +140,13 @@ class Simulation:
         if initial:
             self.state = balanced(self.scene, self.state)
         self.jit = time.perf_counter() - began
-        """Seconds spent on compiling or finding the forms."""
+        """Time for compiling or loading the forms, s."""
 
     def __str__(self) -> str:
-        """Return a table of the terms and solvers that the scene has, and why it does without the others."""
+        """Return a table of the scene's terms and solvers, with the reason for each omitted one."""
         return summary.table(self.scene, self.state)
 
-    # ---- what may be asked ----------------------------------------------------------------------
+    # ---- results --------------------------------------------------------------------------------
 
     @property
     def grid(self) -> Grid:
@@ -160,7 +160,7 @@ class Simulation:
 
     @property
     def points(self) -> MaterialPoints:
-        """The material points of this process; their arrays can be read, not written."""
+        """The material points of this process; their arrays are read-only."""
         return self.state.points.placed(self.grid.base)
 
     @property
@@ -174,68 +174,68 @@ class Simulation:
 
     @property
     def result(self) -> Result | None:
-        """Histories of the last run, also while it runs."""
+        """Histories of the last run, or of the present one."""
         return self.state.result
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
-        """The conditions in force, as they were given."""
+        """The active conditions, as they were given."""
         return tuple(self.state.stage.given.values())
 
     @property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,) by which each given displacement acts on the bodies, by its name, N (N/m in plane strain).
+        """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain).
 
-        In axisymmetry all around, the radial one the sum of what acts outward.  Of the last step; nan where none has
-        been taken since a stage set them.
+        In axisymmetry over the full circumference; the radial one sums outward forces. Of the last step; nan before the
+        first step of a stage.
         """
         return self.outcome("reactions")
 
     @property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it holds nothing.
+        """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it fixes nothing.
 
-        A component of a node that two walls hold counts once: for the wall across it, else half for each.
+        Where two walls fix a component of a node, it counts once: for the wall normal to it, else half for each.
         """
         return self.outcome("wall_reactions")
 
     @property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """What leaves through each drained side and inflow, by its name, m^3/s (m^2/s in plane strain)."""
+        """Outflow through each drained side and inflow, by name, m^3/s (m^2/s in plane strain)."""
         return self.outcome("outflows")
 
     @property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Force and moment (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by its name."""
+        """Force and moment (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by name."""
         return self.outcome("tool_forces")
 
     @property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """How far a load has pushed each `Tool` beyond its displacement, by its name, m."""
+        """Displacement of each load-controlled `Tool` beyond its prescribed displacement, by name, m."""
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return what conditions do to the bodies at the end of the last step, by name: of the above, or own ones."""
+        """Return an outcome of conditions at the end of the last step, by name: one of these, or a user's own."""
         return ByName(self.state.outcome.get(quantity, {}))
 
     @property
     def present(self) -> tuple[bool, ...]:
-        """Which bodies are there."""
+        """Whether each body is present."""
         return self.state.stage.present
 
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points.
 
-        In axisymmetry (n, 3, 3), of radius, axis and hoops.  On several processes all call it together.
+        In axisymmetry it is (n, 3, 3), in the radial, axial and hoop directions. The call is collective.
         """
         return self.scene.materials.effective_stress(self.state.points)
 
     def point_fields(self) -> PointFields:
-        """Return stresses, p', q and porosity of the points, see `PointFields`; all processes call it together."""
+        """Return stresses, p', q and porosity of the points, see `PointFields`; the call is collective."""
         return point_fields(self.scene, self.state.points)
 
     def cells(self) -> CellFields:
-        """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
+        """Return centroids and fields of the cells, see `CellFields`; the call is collective."""
         return cell_fields(self.scene, self.state)
 
     # ---- stages and steps -----------------------------------------------------------------------
@@ -252,63 +252,62 @@ class Simulation:
         reset_displacement: bool = False,
         fields: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        """Begin a stage: bodies come and go; what is given takes the place of what was in force.
+        """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        Stresses and pressures stay what they are; the next `run` finds the new balance, all at once or, where
-        loads depend on time, little by little.
+        Stresses and pressures are kept. The next `run` finds the new equilibrium: at once, or gradually under varying
+        loads.
 
         Parameters
         ----------
         walls, gravity
             As for the scene; `gravity` only if the scene had it.
         inertia
-            Whether bodies have inertia from now on; only if the scene may.  Bodies that get it begin at rest.
+            Whether bodies have inertia from now on; only if the scene allows it. Bodies then start at rest.
         conditions
-            All conditions from now on; without, those in force stay: `[*simulation.conditions, more]` adds one.
-            Contacts are those of the scene, named or not.
+            All conditions from now on; by default the active ones stay. `[*simulation.conditions, more]` adds one.
+            Contacts always stay, named or not.
         add
-            Indices of bodies that were to come `later`: a fill, at rest and without stress, put onto the
-            present surface of what it touches as seeded; the side opposite to it stays where it was seeded.
+            Indices of bodies in `later`: a fill, at rest and without stress. It is placed on the present surface of the
+            bodies that it touched when seeded; its opposite side stays at its seeded position.
         remove
-            Indices of bodies: an excavation.
+            Indices of bodies to remove: an excavation.
         reset_displacement
-            From now on displacements count from the present positions.  Conditions that stay are as they
-            were: a `Displacement` then counts from there too, and moves its side once more.
+            Measure displacements from the present positions. Conditions that stay are not changed: a `Displacement`
+            then counts from there too, and moves its side once more.
         fields
-            New values (n, ...) at the points of this process, or one for all, of what they carry in `points.data`:
-            constants of materials that were given as functions of place, and state of laws; or data of your own, that
-            the points take along.
+            New values (n, ...) at this process's points, or one for all, of entries of `points.data`: constants of
+            materials that vary in space, state of laws, or new data of the user, which the points then carry.
 
         Raises
         ------
         ValueError
-            The scene is then what it was.
+            Invalid input; the scene is unchanged.
         """
         given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": inertia}
         named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
     def step(self, dt: float) -> Report:
-        """Advance by dt (s), > 0; return what the step took.
+        """Advance by dt (s), > 0; return the report of the step.
 
         Raises
         ------
         NotConverged, LeftGrid
-            The step cannot be taken; a shorter one may.
+            The step fails; a shorter one may succeed.
         ValueError
-            What a function of time gives is none that is allowed.
+            A function of time returns an invalid value.
         """
         self.state, report = self.advanced(dt)
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
-        """Return the state after a step of dt (s), and what it took; how: other substeps.  The own state stays."""
+        """Return the state after a step of dt (s), and its report; how: other substeps. The state is unchanged."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
             return step(self.scene, self.state, dt, *how)
         except StepFailed:
             raise
-        except BaseException as error:  # broken off anywhere
+        except BaseException as error:  # interrupted anywhere
             self.scene.forget()
             raise_interrupt(error)
             raise

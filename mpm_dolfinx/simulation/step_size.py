@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How long the steps of a run are: all alike, or by the error that each has made."""
+"""Lengths of the steps of a run: equal steps, or adaptive steps from their estimated error."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.step_control import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Share of what a step should be long below which it is not cut.
+"""Smallest cut step relative to the nominal step: equal steps, adaptive steps.
 
-Steps by error grow over decades: where soil begins to slide they have to come down to the time that this takes.
+Adaptive steps grow over decades; at the onset of sliding they must shrink to its time scale.
 """
 FINEST = NEAR**2
-"""Share of the time below which steps by error are not cut: bodies that burst would take ever shorter ones.
+"""Smallest adaptive step relative to the time: bodies that burst would need ever smaller steps.
 
-Source: epsilon, a shorter step is told from the time by less than four digits.
+Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""A step by error follows SAFETY times its error's root, by SHRINKS to GROWS; below KEEPS it stays as it is.
+"""The next adaptive step is SAFETY over a root of the relative error, in SHRINKS to GROWS; below KEEPS it is unchanged.
 
 Source: Hairer, Norsett and Wanner (1993), eq. 4.13; the last Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden change of the pressures, in proportion to the largest so far, from which on a step is taken in two halves.
+"""Sudden pressure change, relative to the largest change so far, above which two halves replace a step.
 
-The stability function is never below -0.21: what goes unseen overshoots by a thousandth.
+The stability function is never below -0.21: an undetected jump overshoots by a thousandth.
 """
 AGAIN = 2.0
-"""Sudden changes, in proportion to those in the step before and its length, that need not be those of jumps."""
+"""Sudden change, relative to the previous step's at the same rate, up to which it does not count as a jump."""
 MOST = SAME / EPSILON
-"""Output intervals of a run.  Source: exact bound, with more a step's slack SAME is below epsilon times the time."""
+"""Most output intervals. Source: exact bound, with more a step's slack SAME is below epsilon times the time."""
 RESOLVED = 10
-"""Errors that can be told from what the solver leaves, in proportion to its tolerance."""
+"""Smallest `rtol` in units of the solver's tolerance: smaller errors disappear in the solver's."""
 FIRST = 1e-3
-"""Share of the first output interval that a step by error is first tried with at least."""
+"""Smallest first adaptive step, relative to the first output interval."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class StepSize:
     Parameters
     ----------
     first, longest : s
-        The step to begin with; the step where all are alike, else the longest.
+        First step; equal step, or longest adaptive step.
     rtol
-        Largest error of the pressures in proportion to their largest change since the run began, or to what it would
-        be in the step if no fluid flowed; None: equal steps.
+        Tolerance of the pressure error, relative to the largest pressure change since the start of the run, or to the
+        undrained change of the step if larger; None: equal steps.
     """
 
     first: float
@@ -69,90 +69,89 @@ class StepSize:
 
     @property
     def by_error(self) -> bool:
-        """Whether steps are chosen by their error."""
+        """Whether the steps are adaptive."""
         return self.rtol is not None
 
     def ended(self, t: float, target: float, control: StepControl) -> bool:
-        """Return whether a time, s, is the target but for rounding."""
+        """Return whether a time, s, is the target up to rounding."""
         slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(control.small, self.longest)
         return target - t <= slack
 
     def least(self, wanted: float, t: float) -> float:
-        """Return the length, s, below which a step is not cut at a time, s, that should be so long."""
+        """Return the smallest step, s, allowed at time t, s, for a nominal step, s."""
         return max(MIN_CUT_BY_ERROR * wanted, FINEST * abs(t)) if self.by_error else MIN_CUT * wanted
 
     def wanted(self, taken: float) -> float:
-        """Return what a step should be that is first tried with a length, s: below a share of it it is not cut."""
+        """Return the nominal step, s, for `least`, from the first trial step, s."""
         return taken if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, fitted to the time that is left to the next output."""
-        if self.by_error:  # no scrap of a step before an output
-            small = min(small, self.longest)  # of a run that went on with other steps it may be longer
+        """Return the length of the next step, s: `small`, fitted to the time left until the next output."""
+        if self.by_error:  # no tiny step before an output
+            small = min(small, self.longest)  # it may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
-        # steps that fit but for rounding are all of the same length
+        # steps that fit up to rounding all have the same length
         return left if not left > (1 - SAME) * small else small
 
     def refused(self, taken: float, report: Report, control: StepControl) -> float:
-        """Return by how much its error has to shrink a step that has been solved; 1 where it is accepted.
+        """Return the factor by which a solved step must shrink to meet the error tolerance; 1 if it is accepted.
 
-        After a jump of the loads one long step may overshoot by a fifth of what is left, two halves of it do not: the
-        stability function is squared.
+        After a jump of the loads one long step overshoots by up to a fifth of the remaining change; two halves do not.
         """
         if not self.by_error:
             return 0.5 if taken > 0.75 * self.longest and self._rings(taken, report, control) else 1.0
-        # steps are refused where loads jump or bend, mostly: there the error is of first order
+        # most refused steps are at jumps or kinks of the loads, where the error is of first order
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, taken: float, report: Report, control: StepControl, failed: bool) -> float:
-        """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
+        """Return the next trial step after a completed one, s; failed: whether a longer one had not converged."""
         if not self.by_error:
-            grows = report.easy and not self._rings(taken, report, control)  # twice as long it would be refused
+            grows = report.easy and not self._rings(taken, report, control)  # twice the step would be refused
             return max(control.small, min(2 * taken, self.longest)) if grows else control.small
         factor = self._factor(report, control, 0.5)
         if factor >= 1:
-            # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts, not 1
+            # a step as long as a failed one mostly fails again: 78 cuts in place of 1 in soil that yields
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
-            return min(max(taken * factor, control.small), self.longest)  # it may have been short for an output's sake
+            return min(max(taken * factor, control.small), self.longest)  # it may have been shortened for an output
         return taken * factor
 
     def cut(self, taken: float, control: StepControl) -> StepControl:
-        """Return the memory with half a step, s, to try next: the step has not converged."""
+        """Return the step control with half a step, s, as the next trial, after a step without convergence."""
         whole = taken > (1 - SAME) * control.small
         waits = 2 * control.waits + 1 if whole and control.kept == 0 else control.waits
         return replace(control, small=taken / 2, waits=waits, kept=1)
 
     def grown(self, taken: float, report: Report, control: StepControl, failed: bool) -> StepControl:
-        """Return the memory with the step to try next after one that was taken, s; failed: see `next`.
+        """Return the step control with the next trial step after a completed step, s; failed: see `next`.
 
-        Equal steps that were cut grow at once, until one that has just grown fails as well: then they wait for one more
-        step, for three, seven ..., and for half as many after one that has grown has converged.  `waits` is how many,
-        `kept` how many steps there were since the last cut or growth, from one on; 0: the step has just grown.
+        Equal steps grow at once after a cut, until a newly grown step fails too. They then wait for one more step, for
+        three, seven and so on. Half the wait remains when a newly grown step converges. `waits` is this number; `kept`
+        counts the steps since the last cut or growth: 0 directly after growth.
         """
         small, whole = self.next(taken, report, control, failed), taken > (1 - SAME) * control.small
         if self.by_error:
             return replace(control, small=small)
         waits = control.waits // 2 if whole and control.kept == 0 else control.waits
-        if small > (1 + SAME) * control.small and control.kept > waits:  # not by rounding only
+        if small > (1 + SAME) * control.small and control.kept > waits:  # beyond rounding
             return replace(control, small=small, waits=waits, kept=0)
-        # a step that was fitted to an output tells nothing of longer ones
+        # a step fitted to an output says nothing about longer ones
         return replace(control, waits=waits, kept=control.kept + whole)
 
     def _rings(self, taken: float, report: Report, control: StepControl) -> bool:
-        """Return whether a step may have overshot.
+        """Return whether a step may have overshot a jump.
 
-        What is as sudden in step after step is no jump of the loads, of which a step leaves a fifth at most: where the
-        grid is reset in every step, pressures beside an edge that is pushed into a body change in the first substep.
+        A step leaves at most a fifth of a jump of the loads. A change that is equally sudden in successive steps is
+        therefore no jump. An edge pushed into a body causes such changes: the grid is reset in every step.
         """
         return report.sudden - AGAIN * control.first * taken > RINGS * control.change
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the step whose error would be as large as it may be, in proportion to one that was solved."""
+        """Return the length of a step with the tolerated error, relative to a solved step."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return by how much the error of a step is larger than it may be: of pressures, water content, or motion."""
+        """Return the error of a step over its tolerance: the largest ratio for pressure, motion and water content."""
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
         allowed = self._allowed(report, control)
@@ -165,16 +164,16 @@ class StepSize:
         return max(off / least if least > 0 else 0.0 if off == 0 else inf for off, least in errors)
 
     def _allowed(self, report: Report, control: StepControl) -> float:
-        """Return how large the error of the pressures may be in a step, Pa.
+        """Return the tolerance of the pressure error in a step, Pa.
 
-        Where water flows freely pressures follow the motion of the bodies: what time steps make of them moves nothing,
-        and what the grid makes of them, some percent, no shorter step mends.
+        The undrained pressure change counts because freely draining pressures follow the motion. Their error from the
+        time step affects no motion, and the grid's error, some percent, does not fall with the step.
         """
         return self.rtol * max(control.change, report.sealed)
 
 
 def measured(control: StepControl, report: Report, result: Result) -> StepControl:
-    """Return the memory with the largest change of the pressures so far, that of a step that was solved included."""
+    """Return the step control with the largest changes of pressure, motion and water content so far."""
     change = max(control.change, report.change, NEAR * report.stress)
     if len(result.rows) and len(start := result.pressure[0]) and report.extremes is not None:
         change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start.tolist(), strict=True)))
@@ -188,16 +187,16 @@ class Times:
     Parameters
     ----------
     start, now : s
-        Where the run began, and where it goes on.
+        Start of the run, and time from which it continues.
     end, interval, given, rtol
         t_end, dt, t_eval and rtol of `run`.
     goes_on
-        Whether the run goes on with histories.
+        Whether the run continues histories.
 
     Raises
     ------
     ValueError
-        Naming what is not allowed: no time left, or more steps than times can tell apart.
+        An invalid argument, no time left, or more steps than floating-point times can resolve.
     """
 
     def __init__(self, start: float, now: float, end, interval, given, rtol, goes_on: bool):
@@ -211,7 +210,7 @@ class Times:
                 f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, s, 0 without; whether every step is an output."""
+        """Output interval, s, 0 without one; whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731
@@ -227,22 +226,22 @@ class Times:
         self.start = start
 
     def after(self, t: float) -> list[float]:
-        """Return the output times after one, s, the end included."""
+        """Return the output times after a time, s, the end included."""
         if self._times is not None:
             return [*(time for time in self._times if t < time < self.end), *([self.end] if t < self.end else [])]
-        # a last interval that is a fraction of dt counts as one
+        # a last fraction of dt counts as an interval
         start, dt = self.start, self.interval
         done = round((t - start) / dt)
         count = max(done + (self.end - t > SAME * dt), round((self.end - start) / dt))
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return until when a run that has been broken off after an output time may have got, s."""
+        """Return the latest time, s, that an interrupted run may have reached after the output time t."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time in which pressures diffuse through a cell, h^2 / c_v, s; 0 where nothing conducts."""
+    """Return the least time of pressure diffusion through a cell, h^2 / c_v, s; 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -256,7 +255,7 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def cell_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time in which waves run through a cell, s."""
+    """Return the least travel time of waves through a cell, s."""
     density = scene.materials.density(points)
     at = density > 0
     grid = scene.grid
@@ -267,7 +266,7 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:
-    """Return the rule of a run: see `run`; ValueError naming what is not allowed."""
+    """Return the step rule of a run, see `run`; ValueError for invalid arguments."""
     positive = {"test": lambda v: v > 0, "allowed": "> 0"}
     if rtol is None:
         for name, value in {"first_step": first_step, "max_step": max_step if max_step != inf else None}.items():
@@ -277,17 +276,17 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     least = RESOLVED * scene.scheme.tolerance
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
     if scene.numerics.method == "backward-euler":
-        raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
+        raise ValueError(f"rtol = {line(rtol)}: backward-euler has no error estimate, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
-        raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
+        raise ValueError(f"rtol = {line(rtol)}: without flow there is no error estimate for velocities, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
-    if len(scene.substeps) > 1:  # without a rate no step has an error
-        # under a load that grows from nothing the error is ERROR dt c_v / h^2 of the change
+    if len(scene.substeps) > 1:  # without time derivatives there is no error
+        # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
-    if inertia:  # what is let go, or pushed all of a sudden
+    if inertia:  # for release or sudden loading
         first = min(first, cell_time(scene, points))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))

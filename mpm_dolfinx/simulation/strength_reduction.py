@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""The factor of safety: by what the strength of soil may be divided before bodies at rest begin to slide.
+"""The factor of safety by strength reduction: the largest divisor of the soil's strength at which bodies stay at rest.
 
-Cohesion, tensile strength and the tangents of the angles of friction and dilation are divided by a factor F (Griffiths
-and Lane 1999; dilation too, so that associated flow stays associated).  Soil that is too weak has no equilibrium, but a
-solver that finds none says nothing about the soil.  So each trial goes on in time against a viscous stress, and what is
-judged is the overload: the share of the shear stress, where soil moves, that this viscous stress bears.  A body that
-comes to rest hands its load over to the strength of its soil, and the overload dies away.  In a slide it stays: there
-it is what the strength lacks, whatever the viscosity and the size of the cells.
+A factor F divides cohesion, tensile strength and the tangents of the angles of friction and dilation (Griffiths and
+Lane 1999). Dilation is divided too, so that associated flow stays associated. Soil that is too weak has no equilibrium,
+but a solver without convergence says nothing about the soil. Each trial therefore advances in time against a viscous
+stress. The criterion is the overload: the fraction of the shear stress, in moving soil, that the viscous stress bears.
+In a body that comes to rest, the soil's strength takes over the load, and the overload vanishes. In a slide it stays:
+it is the missing strength, whatever the viscosity and the cell size.
 
-All trials begin from stresses that soil of unlimited strength bears.  Bodies at rest have them: nothing moves when
-yielding ends.  Bodies that have not been run, because they cannot stand, find them in an elastic step.
+All trials start from the stresses of soil with unlimited strength. Bodies at rest have such stresses. Bodies that were
+not run, because they cannot stand, reach them in an elastic step.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""By how much factors are tried further out until one rests and one slides, and how far from 1 that goes."""
+"""Ratio of successive trial factors until one rests and one slides; largest ratio to 1."""
 LACKS = 0.25
-"""Overload up to which a trial rests, over `rtol`.
+"""Largest overload of a trial at rest, over `rtol`.
 
-At once it is 0.9 of what the strength of a uniform block lacks, and 0.6 of that of a slope; in a slide at the end of a
-trial half as much.  With an eighth and a half the slope's factor differs by 1.1 and 0.5 %.
+The initial overload is 0.9 of the missing strength in a uniform block, and 0.6 in a slope; at the end of a sliding
+trial it is half of that. With an eighth and a half the slope's factor differs by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strains in a trial of a slide that is just told from rest, in elastic strains at yield; in overloads at most.
+"""Strain in a trial of a marginal slide, in elastic strains at yield; in overloads at most.
 
-Stresses of soil that begins to flow find their new places within a few strains at yield.  In soft soil they would
-change the shape of the body: there the viscosity is larger.  Half and twice as much change the factor of a slope by
-0.5 %, twice the steps by less than 0.1 %.
+Stresses of soil that begins to flow redistribute within a few strains at yield. In soft soil these would change the
+shape of the body: the viscosity is larger there. Half and twice as much change the factor of a slope by 0.5 %, twice
+the steps by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -65,14 +65,14 @@ ANGLES = ("friction", "dilation")
 
 @dataclass(frozen=True)
 class Safety:
-    """A factor of safety, and how it was found.
+    """A factor of safety, and its trials.
 
     factor
         Mean of the two bounds.
     bounds
-        Largest factor at which the bodies came to rest, and smallest at which they did not.
+        Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Factor -> share of the shear stress that the soil's strength does not bear, in each step of the trial (n,).
+        Factor -> fraction of the shear stress in excess of the soil's strength, in each step of the trial (n,).
     newton
         Newton steps of all trials.
     """
@@ -86,38 +86,42 @@ class Safety:
 def factor_of_safety(
     simulation: Simulation, *, dt: float | None = None, rtol: float = 0.01, steps: int = 10, progress: bool = True
 ) -> Safety:
-    """Return by what the strength of soil may be divided before bodies at rest begin to slide.
+    """Return the factor of safety by strength reduction: bodies slide when their strength is divided by more than it.
 
-    The simulation stays what it is.  One that cannot stand need not be run: trials begin where its soil, as if it could
-    not yield, is after a step of dt.  On several processes all call it together.  Suction is in the effective stress,
-    and so counts as strength.  Friction of tools is not divided.
+    The simulation is unchanged. A scene that cannot stand needs no run: trials start from an elastic step of dt. The
+    call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided.
 
     Parameters
     ----------
     simulation
-        Under the loads that act; where they are functions of time, they should no longer change.
+        Scene under its loads; functions of time must have become constant.
     dt
-        Length of a step, s, > 0: long beside what viscosities of laws and terms need.  It must be given where fluid
+        Length of a step, s, > 0: long compared with viscous time scales of laws and terms. It is required where fluid
         flows: short for undrained, long for drained failure.
     rtol
-        Relative distance of the bounds at the end, in [1e-4, 0.5].
+        Final relative distance of the bounds, in [1e-4, 0.5].
     steps
-        At most so many in a trial, >= 8; who has not come to rest by then slides.
+        Most steps in a trial, >= 8; bodies slide if they have not come to rest by then.
     progress
         Show a progress bar on a terminal.
+
+    Returns
+    -------
+    Safety
+        The factor, its bounds and all trials.
 
     Raises
     ------
     ValueError
-        Naming the argument; soil whose strength is none that can be divided; bodies without stress, that do not slide
-        with a sixteenth of their strength, or that do not come to rest with sixteen times as much.
+        An invalid argument; soil with a strength that cannot be divided; bodies without stress, that do not slide with
+        a sixteenth of their strength, or that do not come to rest with sixteen times as much.
     GaveUp
-        A step of a trial that does not converge, however short.
+        A step of a trial does not converge, however short.
     """
     if not isinstance(getattr(simulation, "scene", None), Scene):
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
     if simulation.state.stage.inertia:
-        raise ValueError("factor_of_safety: bodies have inertia, must be a stage without: stage(inertia=False)")
+        raise ValueError("factor_of_safety: bodies have inertia, must be quasi-static: stage(inertia=False)")
     dt, steps = _step_of(simulation, dt), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
     flag("progress", progress)
@@ -143,7 +147,7 @@ def factor_of_safety(
 
 
 class _Bar:
-    """A line on a terminal that tells what has been tried and where the present trial is."""
+    """A terminal line with the results of trials, and the progress of the present one."""
 
     def __init__(self, shown: bool):
         self._bar = tqdm(bar_format="{desc}, {n_fmt} steps, {elapsed}{postfix}", disable=None if shown else True)
@@ -166,26 +170,26 @@ class _Bar:
         self._bar.set_postfix_str(f"strength over {factor:.4g}: step {count}, overload {overload:.1e}{known}")
 
     def tried(self, factor: float, judged: str) -> None:
-        """Note what has become of a trial."""
+        """Note the result of a trial."""
         self._known[judged] = f"{factor:.4g}"
 
 
 def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
-    """Return a factor with which bodies rest and a larger one with which they slide, one after the other from 1 on."""
+    """Return a factor at which bodies rest and a larger one at which they slide, from successive trials from 1 on."""
     known, wider = 1.0, WIDER if (begins := rests(1.0)) else 1 / WIDER
     while 1 / WIDEST <= (trial := known * wider) <= WIDEST:
         if rests(trial) != begins:
             return min(known, trial), max(known, trial)
         known = trial
     found = "come to rest" if begins else "slide"
-    more = "" if begins else "; what acts on them must not change in time"
+    more = "" if begins else "; loads must be constant in time"
     raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor{more}")
 
 
 def _step_of(simulation: Simulation, dt: float | None) -> float:
     """Return the length of a step, s."""
     if dt is None and simulation.scene.flows:
-        raise ValueError("dt is not given, must be where fluid flows: short for undrained, long for drained failure, s")
+        raise ValueError("dt = None: must be given where fluid flows: short for undrained, long for drained failure, s")
     return _positive("dt", 1.0 if dt is None else dt)
 
 
@@ -194,10 +198,10 @@ def _positive(name: str, value: float) -> float:
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
-    """Return whether it is known what becomes of a trial, of the overload of each step so far.
+    """Return whether the result of a trial is known from the overload of each step so far.
 
-    It falls ever more slowly.  So a body slides if it would not come to rest in the steps that are left at the rate of
-    the last one.
+    The overload falls ever more slowly. A body therefore slides if, at the rate of the last step, it would not come to
+    rest in the remaining steps.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -206,21 +210,21 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """What the time loop drives; newton: is given the Newton steps of each step."""
+    """A trial as driven by the time loop; newton: list that receives the Newton steps of each step."""
 
     scene: Scene
     state: State
     newton: list[int]
 
     def advanced(self, dt: float) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and what it took."""
+        """Return the state after a step of dt, s, and its report."""
         state, report = step(self.scene, self.state, dt)
         self.newton.append(report.newton)
         return state, report
 
 
 class _Weakened:
-    """The scene of a simulation with strengths on its points, and a viscous stress; see `factor_of_safety`."""
+    """The scene of a simulation with strengths as point data, and a viscous stress; see `factor_of_safety`."""
 
     def __init__(self, simulation: Simulation, dt: float, steps: int, least: float):
         scene = simulation.scene
@@ -229,13 +233,13 @@ class _Weakened:
         self._least = least
         for m in scene.materials.materials:
             if m.state and not isinstance(m, Frictional):
-                what = f"factor_of_safety: strength of {type(m).__name__} is none that can be divided"
+                what = f"factor_of_safety: strength of {type(m).__name__} cannot be divided"
                 raise ValueError(f"{what}, must be a law with friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: contacts: must be none")
-        begun = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
+        begun = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data of its grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
         def resistance(points, u, dt):
@@ -253,7 +257,7 @@ class _Weakened:
             weighs=scene.gravity is not None,
             pressure=0.0,
             extensions=([*terms, resistance], sources),
-            initial={},  # what initial stresses need the materials have
+            initial={},  # the materials already have their data for initial stresses
         )
         self._strengths, self.newton = _strengths(scene, begun.points), []
         points = replace(begun.points, data={**begun.points.data, **self._strengths})
@@ -263,7 +267,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overload of each step (n,), until it is known what becomes of it; tell: called with each."""
+        """Return the overload of each step (n,) until the result is known; tell: called with each step."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -273,29 +277,29 @@ class _Weakened:
         return np.array(out)
 
     def _unyielding(self, begun: State) -> State:
-        """Return the state after a step of soil that does not yield below strains of one."""
+        """Return the state after a step with soil that does not yield below strains of one."""
         moduli = self._scene.materials.table(begun.points, lambda m: m.oedometric)
         trial = self._trial(begun, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
         self._go_on(trial, "soil that cannot yield")
         return replace(trial.state, t=begun.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial from a state on, with other strengths of its points."""
+        """Return a trial that starts from a state, with other strengths at its points."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
-        """Take a step; what: names the strength."""
+        """Take a step; what: names the strength in an error message."""
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step over that of the shear stress, both in size.
+        """Return the work of the viscous stress in a step over that of the shear stress, by magnitude.
 
-        Points that have gone to another process are left out.
+        Points that moved to another process are left out.
         """
         _, old, new = np.intersect1d(before.id, now.id, assume_unique=True, return_indices=True)
         d = before.F.shape[1]
@@ -315,7 +319,7 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean size of the effective stress, Pa; refuse one that rounding of coordinates has made."""
+    """Return the mean norm of the effective stress, Pa; refuse a stress within the rounding of coordinates."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -323,12 +327,12 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
     sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
     total, rounding, whole_volume = over_all(grid.comm, sums)
     if not total > rounding:
-        raise ValueError("factor_of_safety: the bodies have no stress, must be at rest under what acts on them")
+        raise ValueError("factor_of_safety: the bodies have no stress, must be at rest under loads")
     return float(total / whole_volume)
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of the shear moduli of soil with a strength, Pa: the soft soil is what flows."""
+    """Return the harmonic mean of the shear moduli of soil with a strength, Pa: soft soil flows first."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
@@ -344,7 +348,7 @@ def _of(m: Skeleton) -> list[str]:
 
 
 def _as_fields(m: Skeleton) -> Skeleton:
-    """Return a material whose strengths are carried by its points."""
+    """Return a material with its strengths as point data."""
     carried = {name: partial(_constant, value=getattr(m, name)) for name in _of(m) if not callable(getattr(m, name))}
     if isinstance(m, Frictional) and m.symmetric:
         carried |= {"dilation": carried.get("friction", m.friction)}
@@ -356,7 +360,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the strengths of the points, name -> (n,), zero where a material has none of the name."""
+    """Return the strengths of the points, name -> (n,), zero for materials without a strength of that name."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

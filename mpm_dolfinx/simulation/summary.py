@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a scene is compiled to: its terms and solvers, and why it does without the others; how it is shared out."""
+"""Summary of a scene: its terms and solvers, reasons for omitted ones, and its distribution over processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mpm_dolfinx.stepping.state import State
 
 @dataclass(frozen=True)
 class Part:
-    """A term or solver: its name, whether the scene has it, what it is or why it is left out."""
+    """A term or solver: its name, whether the scene has it, and its form or the reason for its omission."""
 
     name: str
     used: bool
@@ -29,7 +29,7 @@ class Part:
 
 
 def parts(scene: Scene, state: State) -> list[Part]:
-    """Return the terms and solvers of a scene, as they are so far: some are compiled when first they are needed."""
+    """Return the terms and solvers of a scene at present; some are compiled only when they are needed."""
     return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
 
 
@@ -51,12 +51,12 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either(
             "mean dilatation",
             m.dilatation,
-            f"of what has nu > {LOCKING}, or plastic flow",
+            f"F-bar, for nu > {LOCKING} or plastic flow",
             f"nu <= {LOCKING}, no plastic flow",
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
-        _either("inertia", state.stage.inertia, "of all bodies", "none asked for" if m.inertia is None else "at rest"),
+        _either("inertia", state.stage.inertia, "of all bodies", "not asked" if m.inertia is None else "quasi-static"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         *(_either(kind.title, number[kind.title], f"{number[kind.title]}", "none given") for kind in KINDS),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
@@ -75,7 +75,7 @@ def _storage(s: Scene, state: State) -> list[Part]:
         _either(names[1], f.flux, f"two-point, conductivities over {s.fluid.unit_weight:.6g} N/m^3", still),
         _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
         _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "sealed"),
-        _either(names[4], f.damp.used, "little flows within a step", "enough flows within a step, so far"),
+        _either(names[4], f.damp.used, "little flow within a step", "enough flow within a step, so far"),
         _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
         _either("retention", storage.retains, _laws(s), "no suction drains pores"),
         _either("sources", "sources" in count, f"{count.get('sources')}", "none given"),
@@ -103,7 +103,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
 
 
 def _one_substep(s: Scene) -> str:
-    return "first order in time" if s.numerics.method == "backward-euler" else "nothing has a rate"
+    return "first order in time" if s.numerics.method == "backward-euler" else "no time derivatives"
 
 
 def table(scene: Scene, state: State) -> str:
@@ -114,9 +114,9 @@ def table(scene: Scene, state: State) -> str:
 
 
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
-    """Return the most that one process has over the mean of all: points, pieces, active cells; after the first step.
+    """Return the largest number on a process over the mean of all: points, pieces, active cells; after the first step.
 
-    1 is perfect; the time of a step goes with the pieces.  Called on all processes together.
+    1 is perfect; the time of a step is proportional to the pieces. The call is collective.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None
@@ -128,9 +128,9 @@ def imbalance(scene: Scene, state: State) -> dict[str, float]:
 
 
 def peak_memory() -> float:
-    """Return the most memory that this process has had, MB."""
+    """Return the peak memory of this process, MB."""
     status = Path("/proc/self/status")
-    if status.exists():  # Linux counts the parent's into getrusage
+    if status.exists():  # getrusage includes the parent process on Linux
         (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tangent of the balances at the present state as sparse matrices, for modes and sensitivities."""
+"""The tangent of both balances at the present state as sparse matrices, for modes and sensitivities."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from mpm_dolfinx.stepping.step import set_up
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """Change of the residuals with displacements (n,), m, and pressures (m,), Pa, of a step by backward Euler.
+    """Derivatives of the residuals by displacements (n,), m, and pressures (m,), Pa, for a step by backward Euler.
 
-    The forces change by `stiffness` du + `pressure` dp, N; the fluid by `content` du + `storage` dp, m^d.  In plane
-    strain both are those of 1 m of thickness.  Blocks of pressures are None without fluid.
+    Forces change by `stiffness` du + `pressure` dp, N; fluid contents by `content` du + `storage` dp, m^d. In plane
+    strain both are per metre of thickness. Blocks of pressures are None without fluid.
 
     Parameters
     ----------
     stiffness : (n, n)
-        With penalties: ghost penalty, given displacements, contacts.  Walls' displacements are no unknowns.
+        Stiffness, with penalties: ghost penalty, prescribed displacements, contacts. Fixed displacements are left out.
     nodes, components : (n,)
         Node of the grid and axis of each displacement.
     x : (n, d)
-        Place of the node, m.
+        Position of the node, m.
     pressure, content, storage : (n, m), (m, n), (m, m)
-        Blocks of the pressures; without what fluxes gain by displacements.
+        Blocks of the pressures, without the derivative of fluxes by displacements.
     cells : (m,)
         Cell of each pressure.
     """
@@ -52,7 +52,7 @@ class Tangent:
 
 
 class Simulated(Protocol):
-    """What has a scene and a state."""
+    """An object with a scene and a state."""
 
     scene: Scene
     state: State
@@ -64,7 +64,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     Raises
     ------
     ValueError
-        On several processes.
+        The scene runs on several processes.
     """
     scene, state = simulation.scene, simulation.state
     numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
@@ -84,11 +84,11 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
         of = storage.system
         blocks |= {"pressure": -_csr(of.B_momentum).T.tocsr(), "content": _csr(of.B), "storage": _csr(of.C)}
         blocks["cells"] = of.unknowns.owned.copy()
-    scene.forget()  # these matrices are those of no step
+    scene.forget()  # these matrices belong to no step
     return Tangent(**blocks)
 
 
 def _csr(A: PETSc.Mat) -> csr_matrix:
-    """Return a matrix of one process as one of SciPy's."""
+    """Return a matrix of one process as a SciPy matrix."""
     rows, columns, values = A.getValuesCSR()
     return csr_matrix((values.copy(), columns.copy(), rows.copy()), shape=A.getSize())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The time loop: steps that are cut when they do not converge and grow again, and their histories."""
+"""The time loop: steps, cut where they do not converge and grown again, and their histories."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ PARTS = (
     "move points",
     "output",
 )
-"""Parts of a run that are timed, as `mpm: ...` in dolfinx's own list of timings."""
+"""Timed parts of a run, as `mpm: ...` in dolfinx's list of timings."""
 
 Observer = Callable[[Any], None]
-"""Called with the simulation."""
+"""A function of the simulation."""
 
 
 class Simulated(Protocol):
-    """What the time loop drives: a `Simulation`, whose `state` it replaces."""
+    """The object that the time loop drives: a `Simulation`, whose `state` it replaces."""
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and what it took; how: substeps, if not those of the scene."""
+        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
 
 
 def run(
@@ -83,53 +83,52 @@ def run(
     energies: bool = False,
     progress: bool = True,
 ) -> Result:
-    """Advance to t_end, in steps of dt or in steps chosen by their error.
+    """Advance to t_end, in steps of dt or in adaptive steps.
 
-    A step that does not converge is cut in two; steps then grow again.
+    A step that does not converge is halved; later steps grow again.
 
     Parameters
     ----------
     t_end
         End time, s, not a duration: > t.
     dt
-        Step and output interval, s, > 0; one step to t_end where it is longer than that.  With `rtol` the output
-        interval only; without it and `t_eval` every step is an output.
+        Step and output interval, s, > 0; a longer one is cut to t_end. With `rtol` it is the output interval only;
+        without it and `t_eval` every step is an output.
     rtol
-        Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
-        since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
-        flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
-        as the output intervals; refused there with terms of the velocity, of which no error is known.  Of bodies with
-        inertia the motion counts too, see `motion_error`, in proportion to the largest since the run began.  So does
-        the water content of soil that drains under suction, to the largest change of it in a step so far.  The error
-        is estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
-        the step after a load jumps, see `solve.newton.ERROR`.
+        Choose the steps by their error. The estimated error of the pore pressures stays below about `rtol` times the
+        larger of two changes: the largest since the start of the run, and the undrained change of the step. At least
+        ten times `tolerance`, and < 1. Without flow the steps are the output intervals, and terms with the velocity are
+        refused, because they have no error estimate. With inertia the error of the motion counts too, see
+        `motion_error`, relative to the largest motion since the start. In unsaturated soil so does the error of the
+        water content, relative to its largest change in a step so far. The estimate is a fraction of a first-order
+        step's error, see `solve.newton.ERROR`. True errors were 0.7 to 5 times as large, the latter directly after a
+        jump of the load.
     t_eval : (m,), s
-        Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
+        Output times, increasing, in (t, t_end]; t_end is always one. Steps end at output times.
     first_step, max_step
-        With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.  By default the first is
-        about the time in which pressures diffuse through a cell, times 20 rtol, or a thousandth of the first output.
+        With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 20 rtol times
+        the diffusion time of a cell, and at least a thousandth of the first output interval.
     until
-        Functions of the simulation, or one, that end the run before t_end: where the sign of a number changes within a
-        step, or a truth turns true, such as `lambda s: -s.points.displacement[:, 1].min() - 0.1`.  What is so at the
-        start is no event.  Steps of other lengths find where: the last state is the first one found in which the event
-        has occurred, a thousandth of that step after it at most.  It is an output; `Result.event` says which and when.
-        On several processes all give the same.  Histories that an event has ended are at their end, as at t_end, where
-        a run goes on with them; without `until` it goes on.
+        Functions of the simulation, or one, that end the run before t_end. An event is a change of sign of a number
+        within a step, or a truth value that turns true: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. A
+        condition that holds at the start is no event. Trial steps locate it: the run ends at the first state found
+        after the event, at most a thousandth of the step later. This state is an output; `Result.event` has number and
+        time. The values must be equal on all processes. Histories that ended at an event are complete, as at t_end; a
+        run without `until` continues them.
     probes
-        Particles that are recorded.
+        Particles to record.
     observe
-        Called with the simulation at each output time, such as a `Writer`; its `result` then holds the histories so
+        Functions of the simulation, called at each output time, such as a `Writer`; `result` holds the histories so
         far.
     checkpoint
         Called after all observers: a `Checkpoint`.
     after
-        Histories to go on with, of a run with the same steps: what `resume` returns, or `result` of a run that was
-        interrupted.
+        Histories to continue, of a run with the same steps: from `resume`, or `result` of an interrupted run.
     energies
-        Record energies of bodies with inertia, and works from the start of the run on: `Result.energies`.
+        Record energies of bodies with inertia, and works from the start of the run: `Result.energies`.
     progress
-        Show a progress bar on a terminal, and warn of the first step that is cut; the others are logged as INFO by the
-        logger `mpm_dolfinx`.
+        Show a progress bar on a terminal, and warn of the first cut step. The logger `mpm_dolfinx` reports others as
+        INFO.
 
     Returns
     -------
@@ -138,15 +137,16 @@ def run(
     Raises
     ------
     ValueError
-        An argument, or what a function of time gives, is none that is allowed.
+        An invalid argument, or an invalid value of a function of time.
     GaveUp
-        With the histories so far; `points` and `t` are those of the last good step.
+        A step failed, however short; the exception has the histories so far. `points` and `t` belong to the last good
+        step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
     _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval, "max_step": max_step})
     if probes is not None and not isinstance(probes, Probes):
-        raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
+        raise ValueError(f"probes = {line(probes)}, must be a result of `probes`")
     observers = [observe] if callable(observe) else observe
     if probes is not None:
         probes.check(simulation.scene.bodies, simulation.state.stage.present)
@@ -182,7 +182,7 @@ def run(
             if checkpoint is not None:
                 checkpoint(simulation)
 
-    # messages above the bar, not into it
+    # messages appear above the bar
     with bar, nullcontext() if bar.disable else logging_redirect_tqdm([logger] if logger.handlers else None):
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.control):
@@ -200,7 +200,7 @@ def run(
 
 
 def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
-    """Refuse arguments that are not the same on all processes, which would wait for each other."""
+    """Refuse arguments that differ between processes, which would otherwise wait for each other."""
     texts = comm.allgather([line(value) for value in given.values()])
     for k, name in enumerate(given):
         for rank, text in enumerate(texts):
@@ -216,7 +216,7 @@ def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
 
 
 def _show(bar: tqdm, state: State, before: float) -> None:
-    """Show where a run is."""
+    """Update the progress bar."""
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
@@ -225,13 +225,13 @@ def _show(bar: tqdm, state: State, before: float) -> None:
 
 
 def _note(simulation: Simulated, result: Result, control: StepControl | None = None) -> Result:
-    """Note the histories so far in the state, and the memory of the step sizes if it has changed."""
+    """Store the histories in the state, and the step control if it is given."""
     simulation.state = replace(simulation.state, result=result, control=control or simulation.state.control)
     return result
 
 
 def _takes_nothing(function: Callable) -> bool:
-    """Return whether a function is known to have no argument; of some that are built in nothing is known."""
+    """Return whether a function takes no argument; False for built-in functions without a signature."""
     try:
         return not signature(function).parameters
     except (TypeError, ValueError):
@@ -239,11 +239,11 @@ def _takes_nothing(function: Callable) -> bool:
 
 
 def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
-    """Call an observer; raise on all processes if it raises on one, that none waits for the others."""
+    """Call an observer; an error on one process is raised on all, so that none waits for the others."""
     raised = None
     try:
         observer(simulation)
-    except BaseException as error:  # also Ctrl-C
+    except BaseException as error:  # including Ctrl-C
         raised = error
     where = first(comm, "" if raised is None else f"process {comm.rank}")
     if raised is not None:
@@ -255,7 +255,7 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return new histories that begin with the present state, or those to go on with, and the memory of the steps."""
+    """Return new histories from the present state, or the histories to continue, and the step control."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
@@ -265,27 +265,27 @@ def _histories(
         begun = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), begun
     if latest is None or control is None or after.rows.run is not latest.rows.run:
-        raise ValueError("after: histories of another run, must be those of the last one, or what `resume` returns")
-    after = latest  # which may have gone on since, or not
+        raise ValueError("after: histories of another run, must be of the last one, or a result of `resume`")
+    after = latest  # which may have advanced since
     now = state.t
     start = after.rows[0]
     last = after.rows[-1].t
-    # a run that was broken off has taken a part of its next interval
+    # an interrupted run may be within its next interval
     if control.interval != times.interval or not last <= now <= times.next(last):
-        what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {control.interval!r}"
-        raise ValueError(f"{what}, t = {last!r}; with other steps, or t_eval, begin new histories: without after")
+        what = f"dt = {times.interval!r} from t = {now!r}: the run to continue has dt = {control.interval!r}"
+        raise ValueError(f"{what}, t = {last!r}; for other steps, or t_eval, start new histories, without after")
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
-        raise ValueError(f"probes: the run to go on with has {recorded} of them")
+        raise ValueError(f"probes: the run to continue has {recorded} of them")
     if count and probes.stressed != (len(start.probe_stress) > 0):
-        raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
+        raise ValueError(f"probes: stress = {probes.stressed}, must be as in the run to continue")
     return after, control
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with energies from which works count, or with those of a run that goes on; or without any."""
+    """Return the state with new energies, with the energies of a continued run, or without."""
     if energies and not state.stage.inertia:
-        raise ValueError("energies = True: bodies have no inertia, must be a stage with inertia=True")
+        raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
@@ -295,14 +295,14 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, those that its histories have already included."""
+    """Wall time and profile of a run, including the times of the histories that it continues."""
 
     def __init__(self, result: Result):
         self._began = time.perf_counter() - result.wall
         self._timed = {part: seconds - result.profile.get(part, 0.0) for part, seconds in _timings().items()}
 
     def read(self, result: Result) -> Result:
-        """Return the histories with the seconds so far."""
+        """Return the histories with the times so far."""
         profile = {part: seconds - self._timed[part] for part, seconds in _timings().items()}
         return replace(result, wall=time.perf_counter() - self._began, profile=profile)
 
@@ -312,7 +312,7 @@ def _timings() -> dict[str, float]:
 
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool, events: Events) -> bool:
-    """Take one step towards a time, s; return whether an event has ended the run in it."""
+    """Take one step towards the time target, s; return whether an event has ended the run."""
     step, new = _advance(simulation, rule, target, aloud)
     found = events.within(step, new)
     if found is None:
@@ -327,7 +327,7 @@ def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool
 def _accepted(
     rule: StepSize, start: State, taken: float, new: State, report: Report, wanted: float | None = None
 ) -> State:
-    """Return the state after a step of a length, s, with the histories; wanted: what it should have been, s."""
+    """Return the state after a step of length taken, s, with its histories; wanted: the nominal step, s."""
     grown = measured(start.control, report, start.result)
     grown = rule.grown(taken, report, grown, failed=taken < (1 - SAME) * (wanted or taken))
     grown = replace(grown, first=0.0 if new.stays else report.first / taken)
@@ -335,9 +335,9 @@ def _accepted(
 
 
 def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> tuple[Step, State]:
-    """Return a step towards a time, s, and its end, cut until it converges and is exact enough.
+    """Return a step towards the time target, s, and its end state; it is cut until it converges and is accurate.
 
-    aloud: say of the first cut of a run that there are some.
+    aloud: warn of the first cut of a run.
     """
     comm = simulation.scene.grid.comm
     wanted = None
@@ -380,9 +380,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
-    """Return the state after a step of dt (s) by backward Euler, and what it took; None: that fails too.
+    """Return the state after a step of dt (s) by backward Euler, and its report; None if it fails too.
 
-    Where loads jump the second substep goes far beyond what is left of them, which soil may not bear.
+    After a jump of the loads the second substep of SDIRK2 overshoots, which soil may not bear.
     """
     if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
         return None
@@ -390,21 +390,21 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
         found = simulation.advanced(dt, EULER)
     except StepFailed:
         return None
-    what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
+    what = "t = %g s: a step of %.3g s by backward Euler, of first order, because none by %s converged: %s"
     values = simulation.state.t, dt, simulation.scene.numerics.method, failed
     warn(simulation.scene.grid.comm, ResolutionWarning, what, *values)
     return found
 
 
 def _has_left(failed: StepFailed, rule: StepSize, taken: float, state: State) -> bool:
-    """Return whether points leave the grid in a step that is exact enough: shorter ones would only lead there."""
+    """Return whether points leave the grid in an accurate step: shorter steps cannot prevent it."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(taken, failed.report, measured(state.control, failed.report, state.result)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
-    """Return why a run gave up at t with a step `small`, s."""
+    """Return the message of a run that gave up at t with a step `small`, s."""
     if isinstance(failed, LeftGrid):
         return str(failed)
     why = "shorter steps help only where loads grow with time, as functions of t; the soil may have no equilibrium"
@@ -412,7 +412,7 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 
 
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
-    """Return what the histories hold of the present state."""
+    """Return the row of the histories for the present state."""
     scene, state = simulation.scene, simulation.state
     comm = scene.grid.comm
     d = scene.grid.dim
@@ -433,7 +433,7 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
 
 
 def _measured(simulation: Simulated) -> Result:
-    """Return the histories with the memory, and how evenly processes share the work."""
+    """Return the histories with memory and load balance of the processes."""
     comm, state = simulation.scene.grid.comm, simulation.state
     points, memory = comm.allreduce(np.array([len(state.points), peak_memory()])).tolist()
     even = imbalance(simulation.scene, state) if comm.size > 1 else {}

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Linear solvers by factors; where they are better than multigrid (`multigrid`): see `plan`.
+"""Direct linear solvers, where they are better than multigrid (`multigrid`): see `plan`.
 
-PETSc's own factors of displacements in blocks, a block a node, take a third of the time of those of single
-unknowns: with 44000 unknowns in 2D and minimum degree ordering 110 ms, 60 again with the same pattern (single 430 and
-150; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290).  A solve takes 4 ms (MUMPS 15, CHOLMOD 9).  Copying
-the entries into blocks takes a tenth of the factorisation.  On two processes MUMPS takes as long, and 25 ms a solve:
-of a few processes one has the factors of displacements that many solves use, and another those of pressures, made at
-the same time.  All of four processes making both, which share the memory's bandwidth, took 1.7 times as long.
+PETSc's own factors of displacements, with a block for each node, take a third of the time of scalar factors. With 44000
+unknowns in 2D and minimum degree ordering they take 110 ms, 60 again with the same pattern (scalar 430 and 150; MUMPS
+260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290). A solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries
+into blocks takes a tenth of the factorisation. On two processes MUMPS takes as long, and 25 ms a solve. With a few
+processes, one therefore holds the factors of displacements that many solves use. Another holds the factors of
+pressures, made at the same time. Making both on all of four processes, which share the memory's bandwidth, took 1.7
+times as long.
 
-Large bodies want nested dissection: with 504000 unknowns in 2D factors take 3.0 s again and 4.6e7 entries by grid
-lines, see `dissection`, by PETSc's nested dissection 5.1 s and 5.0e7, by minimum degree 6 to 12 s and 7.5e7 (MUMPS
-6.2 s and 5.3e7).  With a tenth of the unknowns 80, 110, 120 ms; with fewer all are the same.
+Large bodies need nested dissection. With 504000 unknowns in 2D, repeated factors take 3.0 s and 4.6e7 entries by grid
+lines, see `dissection`. PETSc's nested dissection takes 5.1 s and 5.0e7, minimum degree 6 to 12 s and 7.5e7 (MUMPS 6.2
+s and 5.3e7). With a tenth of the unknowns they take 80, 110, 120 ms; with fewer all are the same.
 
-Those figures are with the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use.  With OpenBLAS MUMPS takes a half
+These figures are with the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use. With OpenBLAS MUMPS takes a half
 to a third of the time.
 """
 
@@ -32,10 +33,10 @@ from mpm_dolfinx.solve.petsc_options import set_defaults
 from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 
 MOST = 500
-"""Most iterations of a linear solve, and vectors that it keeps: it never starts anew.
+"""Most iterations of a linear solve, and size of its Krylov space: there is no restart.
 
-With restarts after 30, PETSc's, FGMRES stagnates where the tangent of a footing is nearly singular: solves that end
-after 500 iterations take 50.  Vectors are allocated as they are needed.
+With PETSc's restarts after 30, FGMRES stagnates where the tangent of a footing is nearly singular: solves that end
+after 500 iterations take 50. Vectors are allocated on demand.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
 
@@ -43,14 +44,14 @@ TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite pr
 def direct_solver(
     A: PETSc.Mat, name: str, symmetric: bool = True, gathered: bool = False, package: str | None = None
 ) -> PETSc.KSP:
-    """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
+    """Return a solver that factorises A, a symmetric one as L D L^T, and again after A has changed.
 
     Parameters
     ----------
     gathered
-        Whether one process has the factors, the last one, with which many systems are solved.
+        Whether one process, the last one, holds the factors; this suits many solves with one matrix.
     package
-        What factorises; None: PETSc, on several processes MUMPS in any case.
+        Package of the factorisation; None: PETSc, but MUMPS on several processes.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -66,7 +67,7 @@ def direct_solver(
             ksp.pc.setFactorSolverType(package)
         else:
             ksp.pc.setFactorOrdering("nd" if gathered else "amd")
-            ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
+            ksp.pc.setFactorPivot(0.0)  # no limit: PETSc's 2e-14 refuses rows of nearly empty cells
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
@@ -80,34 +81,32 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 
 
 def renew(A: PETSc.Mat) -> None:
-    """Let PETSc look at the pattern of a matrix anew, after sums with others.
+    """Rebuild the pattern of a matrix in PETSc after sums with other matrices.
 
-    It orders unknowns by which rows had the same pattern before the sums: LU factors of such an order are wrong.
+    PETSc orders unknowns by equal row patterns before the sums: LU factors with this ordering are wrong.
     """
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 
 
 def solved(ksp: PETSc.KSP, name: str) -> int:
-    """Return the iterations of a solver's last solve; NotConverged where it broke off.
+    """Return the iterations of a solver's last solve; NotConverged if it failed.
 
-    What the most iterations, or an indefinite tangent, give is left to the line search.
+    The line search handles results after the maximum of iterations, or with an indefinite tangent.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
-        raise NotConverged(
-            f"the linear solver of the {name} broke off after {count} iterations (PETSc reason {reason})"
-        )
+        raise NotConverged(f"the linear solver of the {name} failed after {count} iterations (PETSc reason {reason})")
     return count
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:
-    """Return the number of negative eigenvalues of the matrix whose L D L^T factors a direct solver has."""
+    """Return the number of negative eigenvalues of a matrix from the L D L^T factors of its direct solver."""
     factors = solver.pc.getFactorMatrix()
     return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 
 
 def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, symmetric: bool) -> PETSc.KSP:
-    """Return a direct solver for many systems with the same A, a matrix of displacements; how: see `plan`."""
+    """Return a direct solver for many solves with one matrix A of displacements; how: see `plan`."""
     if how != NODAL:
         return direct_solver(A, name, symmetric, package="mumps" if how == MUMPS else None)
     ksp = _preonly(A, name)
@@ -117,13 +116,13 @@ def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, s
 
 
 def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
-    """Let a solver take the factors that a process of this rank has."""
+    """Let a solver use the factors on the process `rank`."""
     ksp.pc.setType(PETSc.PC.Type.PYTHON)
     ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise matrices at the same time where several processes have the factors; else solves do, one by one."""
+    """Factorise matrices at the same time if different processes hold the factors; else each solve does so itself."""
     for pc in preconditioners:
         pc.setUp()
     for pc in preconditioners:
@@ -132,19 +131,19 @@ def factorise(*preconditioners: PETSc.PC) -> None:
 
 
 class Gathered:
-    """Preconditioner for PETSc: factors of a matrix that one of the processes has.
+    """Preconditioner for PETSc: factors of a matrix on one of the processes.
 
     Parameters
     ----------
     x
-        A vector that the matrix multiplies.
+        A vector of the matrix's column space.
     factors
-        Of the whole matrix.
+        Factors of the whole matrix.
     rank
-        Of the process that has them.
+        Process that holds them.
 
-    `setUp` brings a matrix together.  Its factors are made when they are needed, or by `factorise`: processes have each
-    theirs to make once all matrices have been brought together.
+    `setUp` gathers a matrix. Its factors are made on demand, or by `factorise`: after all matrices have been gathered,
+    each process makes its own factors.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -157,7 +156,7 @@ class Gathered:
             self._scatter = PETSc.Scatter().create(x, self._rows, self._whole, self._rows)
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """Bring the present matrix together."""
+        """Gather the present matrix."""
         A = pc.getOperators()[1]
         if self._scatter is None:
             self._factors.take(*A.getValuesCSR())
@@ -185,7 +184,7 @@ class Gathered:
 
 
 class SingleFactors:
-    """Factors of matrices of one process, made when they are needed.
+    """Factors of matrices on one process, made on demand.
 
     Parameters
     ----------
@@ -198,7 +197,7 @@ class SingleFactors:
         self._solver: Latest[tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]] = Latest()
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Take the matrix of these entries."""
+        """Take the matrix with these entries."""
         A = self._solver((rows, columns), lambda: self._of(rows, columns))[0].getOperators()[0]
         A.setValuesCSR(rows, columns, values)
         A.assemble()
@@ -221,14 +220,14 @@ class SingleFactors:
 
 
 class NodalFactors:
-    """Factors of matrices of displacements in blocks, which the first process has, made when they are needed.
+    """Block factors of displacement matrices, held by the first process and made on demand.
 
     Parameters
     ----------
     unknowns
-        Displacements, those of a node one after the other.
+        Displacements; components of a node are consecutive.
     symmetric
-        Factors are U^T D U; if not, L U.
+        Whether factors are U^T D U; else L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):
@@ -237,13 +236,13 @@ class NodalFactors:
         counts = np.concatenate([[0], np.cumsum(comm.allgather(len(np.unique(node))))])
         block = counts[comm.rank] + np.unique(node, return_inverse=True)[1]
         rows = (block, axis, unknowns.positions)
-        self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # whole on the first
+        self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # all on the first
         self._dim, self._symmetric = unknowns.dim, symmetric
         self._factors: Latest[BlockFactors] = Latest()
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Take the matrix of these entries."""
-        if len(rows) > 1:  # else walls hold all nodes: PETSc has no factors of nothing
+        """Take the matrix with these entries."""
+        if len(rows) > 1:  # else walls fix all nodes: PETSc cannot factorise an empty matrix
             make = (rows, columns, *self._nodes, self._dim, self._symmetric)
             self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
 
@@ -258,9 +257,9 @@ class NodalFactors:
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the order (n,) of nodes of a grid at x (n, d), m, by nested dissection.
+    """Return the nested-dissection order (n,) of nodes of a grid at x (n, d), m.
 
-    A box of nodes is halved by the grid line through its middle, whose nodes come last; so are halves and lines.
+    The grid line through the middle of a box of nodes halves it. Its nodes come last. Halves and lines follow likewise.
     """
     at = np.stack([_lines(along) for along in x.T], axis=1)
     high, every = np.tile(at.max(axis=0, initial=0), (len(at), 1)), np.arange(len(at))
@@ -276,13 +275,13 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the numbers (n,) of the grid lines that coordinates (n,) lie on, of those that any does."""
+    """Return the number (n,) of the grid line of each coordinate (n,), counting occupied lines only."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
 
 class BlockFactors:
-    """Factors of matrices of one pattern, with a block a node.
+    """Factors of matrices of one pattern, with a block for each node.
 
     Parameters
     ----------
@@ -291,11 +290,11 @@ class BlockFactors:
     block, axis
         Node and component of each unknown.
     x : (n, d)
-        Where it is, m.
+        Position of each unknown, m.
     dim
         Components of a node.
     symmetric
-        Factors are U^T D U; if not, L U.
+        Whether factors are U^T D U; else L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):
@@ -309,7 +308,7 @@ class BlockFactors:
             kept = np.flatnonzero(np.repeat(node, lengths) <= node[columns])
         place = self._place.astype(np.int32)
         i, j = np.repeat(place, lengths)[kept], place[columns[kept]]
-        # 1 on the diagonal where a component of a node is no unknown
+        # 1 on the diagonal for fixed components of a node
         missing = np.setdiff1d(np.arange(count * dim, dtype=np.int32), place)
         number = np.concatenate([kept, np.full(len(missing), len(columns))]) + 1
         where, n = (np.concatenate([i, missing]), np.concatenate([j, missing])), count * dim
@@ -332,7 +331,7 @@ class BlockFactors:
         self._b.set(0.0)
 
     def take(self, values: NDArray[np.float64]) -> None:
-        """Take the matrix of these entries."""
+        """Take the matrix with these entries."""
         self._matrix.setValuesBlockedIJV(*self._pattern, np.concatenate([[0.0], values, [1.0]])[self._source])
         self._matrix.assemble()
 

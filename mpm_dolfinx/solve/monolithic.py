@@ -1,29 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""Both linearised problems at once, where factors of K cost too much: large bodies in 3D, larger ones in 2D.
+"""Both linearised problems at once, where factors of K are too expensive: large bodies in 3D, larger ones in 2D.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
 
-GMRES, preconditioned from the right with the upper triangle in which the fixed-stress operator P = C + beta V
-stands for the Schur complement C + B K^-1 B^T, and one multigrid cycle each for K^-1 and P^-1.
+The solver is GMRES, preconditioned from the right with the upper block triangle. There the fixed-stress operator P = C
++ beta V approximates the Schur complement C + B K^-1 B^T. One multigrid cycle each approximates K^-1 and P^-1.
 
-In 3D it takes 7 to 12 iterations to 1e-3, each with one cycle on K.  With algebraic multigrid and Jacobi's smoothing
-(10 to 15), conjugate gradients on the Schur complement took 3, but with 35 to 60 cycles in their inner solves; flexible
-GMRES with inner solves to 0.1 or 0.01 12 to 24 cycles, MINRES with the diagonal blocks 17 to 23, leaving five times the
-residual.  In 2D it takes 8 to 1e-5, 12 with an algebraic cycle on P.
+In 3D it takes 7 to 12 iterations to 1e-3, each with one cycle on K. Other methods were slower, with algebraic multigrid
+and Jacobi smoothing (10 to 15 iterations here). Conjugate gradients on the Schur complement took 3 iterations, but 35
+to 60 cycles in their inner solves. Flexible GMRES with inner solves to 0.1 or 0.01 took 12 to 24 cycles. MINRES with
+the diagonal blocks took 17 to 23, and left five times the residual. In 2D it takes 8 to 1e-5, 12 with AMG on P.
 
-At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells.  A solve that takes many (see `plan`), or is
-foreseen to, goes on with factors of K in place of the cycle, which serve until they take as many: for the other
-tangents of the step about 10 iterations.  A step takes 6.2 s, 8.5 s where each tangent is factorised (then 4 to 6
-iterations); four steps of soil that yields, 12^3 cells, 33 and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in
-1.4 s (PETSc in 3.4 s).  No solve takes more than 19 then, nor more than 22 at nu = 0.49 where contrasts are 1e3.
+At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells. A solve that takes many (see `plan`), or is
+predicted to, continues with factors of K in place of the cycle. They stay until a solve with them takes as many: for
+the other tangents of the step about 10 iterations. A step takes 6.2 s, and 8.5 s with factors of each tangent (then 4
+to 6 iterations). Four steps of yielding soil, 12^3 cells, take 33 and 41 s. MUMPS factorises 3190 unknowns in 0.2 s,
+8610 in 1.4 s (PETSc in 3.4 s). No solve takes more than 19 then, nor more than 22 at nu = 0.49 with contrasts of 1e3.
 
-In 2D soil that yields would take 20 to 500 (a footing on 41 cells, whatever smooths): bands that slide are a cell wide,
-and no coarse grid has them.  With a viscosity of 0.05 it takes 28, and on 41 cells a tenth less time than factors, but
-on 81 cells 1.7 times as much.
-
-To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
-alternate almost free: 500 iterations.
+In 2D yielding soil would take 20 to 500 (a footing on 41 cells, with any smoother). Shear bands are one cell wide, and
+coarse grids cannot represent them. With a viscosity of 0.05 it takes 28, and on 41 cells a tenth less time than
+factors, but on 81 cells 1.7 times as much. Moving the volumetric stiffness of K to the storage, p -> p + k B u, leaves
+K as at nu = 0.3, but alternating pressures become almost free: 500 iterations.
 """
 
 from __future__ import annotations
@@ -43,34 +41,34 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import SolverPlan
 
 LEAST = 1e-4
-"""What counts as a little fluid, over what the forces would displace if none was in the pores.
+"""Smallest scale of the fluid, over the fluid volume that the residual forces would displace in a drained body.
 
-In sealed bodies nearly nothing changes places: with scales that differ by 5e5 rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid: with scales that differ by 5e5 rounding left 2e-5 of a residual.
 """
 
 IDLE = object()
-"""Context between solves: PETSc keeps contexts, and all that they refer to."""
+"""Context between solves: PETSc keeps contexts and all of their references."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
-"""Preconditioners that stand for K^-1 and P^-1."""
+"""Preconditioners that approximate K^-1 and P^-1."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlockOperator:
-    """Operator and preconditioner for PETSc in one solve, with rows scaled by what counts as equally large.
+    """Operator and preconditioner of one solve for PETSc, with scaled rows.
 
     Parameters
     ----------
     momentum, storage
         The matrices.
     inverses
-        What stands for K^-1 and P^-1.
+        Approximations of K^-1 and P^-1.
     work
-        Two displacements and two pressures.
+        Two displacement vectors and two pressure vectors.
     scale
-        Of the rows of both.
+        Scales of the rows of both problems.
     slopes
-        What the fluxes gain by displacements, if that counts.
+        Derivative of the fluxes by displacements, if it is included.
     """
 
     momentum: MomentumSystem
@@ -101,7 +99,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return how much fluid the forces of the residual displace in each part (parts,), m^d/N."""
+        """Return the fluid volume that the residual forces displace in each part, over their norm (parts,), m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -167,27 +165,29 @@ class BlockSolver:
         slopes: tuple[FluxSlope, ...] = (),
         factors: Inverses | None = None,
     ) -> tuple[int, Inverses | None]:
-        """Solve for (du, dp) with the problems' residuals on the right.
-
-        Returns the number of iterations, and the factors that then take the place of the cycles, None where none do.
+        """Solve for (du, dp) with the residuals of both problems on the right side.
 
         Parameters
         ----------
         scales : (parts,), (parts,)
-            Of the two residuals in each part, N and m^d: what counts as equally large.
+            Scales of both residuals in each part, N and m^d.
         rtol
-            Relative to the norm of both residuals, scaled, in each part.
+            Tolerance relative to the norm of both scaled residuals, in each part.
         slopes
-            What the fluxes gain by displacements; without, it is left out.
+            Derivative of the fluxes by displacements, if it is included.
         factors
-            Those that take their place so far.
+            Factors in place of the cycles so far.
+
+        Returns
+        -------
+        The number of iterations, and the factors that now replace the cycles, or None.
         """
         operator = BlockOperator(self._momentum, self._storage, factors or self._cycles, self._work)
         on_u, on_p = self._momentum.of_parts, self._storage.of_parts
         residuals = self._momentum.residual, self._storage.residual
         scale_u, scale_p = scales
         scale_p = np.maximum(scale_p, LEAST * scale_u * operator.displaced())
-        if on_u.count > 1:  # nothing couples the parts: each counts as much
+        if on_u.count > 1:  # parts are uncoupled: all count equally
             sizes = [of.norms(r.array_r) for of, r in zip((on_u, on_p), residuals, strict=True)]
             size = np.hypot(sizes[0] / scale_u, sizes[1] / scale_p)
             scale_u, scale_p = (scale * np.where(size > 0, size, 1.0) for scale in (scale_u, scale_p))
@@ -205,7 +205,7 @@ class BlockSolver:
         return count, factors
 
     def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve with these in place of K^-1 and P^-1; return the iterations, at most so many."""
+        """Solve with these approximations of K^-1 and P^-1; return the iterations, at most `most`."""
         operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
@@ -216,7 +216,7 @@ class BlockSolver:
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return preconditioners with factors of the present K, and in 2D of the present P, which may change."""
+        """Return preconditioners with factors of the present K, and in 2D of the present P, which may change later."""
         K, unknowns = self._momentum.K, self._momentum.unknowns
         solvers = [displacement_solver(K, "factors", unknowns, self._plan.fallback, self._plan.symmetric)]
         if unknowns.dim == 2:
@@ -229,7 +229,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends iterations, at most so many, for which the rate of their last quarter is too slow."""
+    """Return a monitor that stops `many` iterations if the rate of the last quarter of them is too slow."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

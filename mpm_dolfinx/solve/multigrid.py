@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Multigrid on the background grid: grids of twice the spacing, on which the same forms are by interpolation.
+"""Geometric multigrid on the background grid: coarse grids of twice the spacing, with interpolated matrices.
 
-A coarse unknown belongs to a node, or a cell, of a grid of half as many cells along each axis.  Displacements are
-interpolated bilinearly between nodes, pressures between centres of cells.  Coarse matrices are Q^T A Q (Galerkin), so
-cut cells, penalties and laws need no care of their own.
+A coarse unknown belongs to a node, or a cell, of a grid of half as many cells along each axis. Displacements are
+interpolated bilinearly between nodes, pressures between centres of cells. Coarse matrices are Q^T A Q (Galerkin), so
+cut cells, penalties and laws need no special treatment.
 
 With 504000 displacements and 251000 pressures in 2D (10^6 points) the grids of both take 0.33 s, coarse matrices 0.1 s
-for each tangent, a cycle 0.06 s; a step 2.6 s in all, by factors (orders, symbolic and numeric ones) 7.6 s.  A wet cube
-of 20^3 cells that is sheared, 16 Newton steps: 2.0 s, by smoothed aggregation (GAMG) 11.6 s in as many iterations.
+for each tangent, a cycle 0.06 s. A step takes 2.6 s in all, with factors (orders, symbolic and numeric ones) 7.6 s. A
+wet cube of 20^3 cells in shear, 16 Newton steps, takes 2.0 s, with smoothed aggregation (GAMG) 11.6 s in as many
+iterations.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ OPTIONS = {
     "mg_levels_pc_type": "sor",
 }
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
-"""Smoothing where volumes hardly change and factors may not take the place of cycles.
+"""Smoothing for nearly incompressible bodies where factors may not replace the cycles.
 
 Two steps of a cube of 14^3 cells with layers of 1 : 1000 at nu = 0.49, without factors, take 126 iterations a solve (by
-GAMG 112); with a single sweep GMRES breaks off.  With factors both take as long.
+GAMG 112); with a single sweep GMRES fails. With factors both take as long.
 """
 MAYBE, NOT, IS = 0, 1, 2  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -52,34 +53,33 @@ def multigrid_solver(
     firmly: bool = False,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> PETSc.KSP:
-    """Return GMRES with multigrid, set up anew when A has changed.
+    """Return GMRES with multigrid, set up again after A has changed.
 
-    GMRES because a tangent may be unsymmetric or, where a body buckles, indefinite.
+    GMRES copes with tangents that are unsymmetric or, in buckling bodies, indefinite.
 
     Parameters
     ----------
     A
         The matrix, which may still be empty.
     name
-        Of its options.
+        Prefix of its options.
     places : (n, d + 1)
-        Of the rows of this process: indices along the axes of the grid, >= 0, and what kind they are of, >= 0: one kind
-        is not interpolated from another.
+        Rows of this process: indices along the axes of the grid, >= 0, and kind, >= 0. Kinds are not mixed.
     held : (m, d + 1)
-        What is no unknown although it belongs to a cell of a body: there interpolations are 0.
+        Fixed degrees of freedom in cells of bodies: interpolations vanish there.
     nodal
-        Whether they are nodes.
+        Whether the unknowns belong to nodes.
     coarsest
-        Unknowns of a grid that is solved on by factors.
+        Unknowns of a grid up to which factors solve on it.
     firmly
         Whether to smooth three times as often: see `FIRMLY`.
     lines : (n,) along each axis, m
-        Grid lines, where cells have many sizes: nodes are then interpolated by their distances.
+        Grid lines, for cells of many sizes: nodes are then interpolated by distance.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
-    ksp.setOptionsPrefix(f"mpm_{name}_{'firmly' if firmly else 'multigrid'}_")  # options for factors are not for it
+    ksp.setOptionsPrefix(f"mpm_{name}_{'firmly' if firmly else 'multigrid'}_")  # separate from the options for factors
     with Timer("mpm: factorisation"):
         steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest, lines)
     ksp.pc.setType(PETSc.PC.Type.MG)
@@ -100,13 +100,13 @@ def interpolations(
     coarsest: int,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> list[PETSc.Mat]:
-    """Return the interpolations from each coarse grid to the one that is twice as fine, the finest first.
+    """Return the interpolations from each coarse grid to the next finer one, the finest first.
 
-    comm: processes that share the unknowns; the others as in `multigrid_solver`.
+    comm: processes that share the unknowns; other parameters as in `multigrid_solver`.
     """
     steps: list[PETSc.Mat] = []
     size = before = over_all(comm, len(places))
-    while not steps or coarsest < size < 0.7 * before:  # many bodies of a few cells are not united
+    while not steps or coarsest < size < 0.7 * before:  # many bodies of a few cells cannot be coarsened
         Q, places, held = interpolation(comm, places, held, nodal, lines)
         lines = None if lines is None else [_every_other(x) for x in lines]
         size, before = over_all(comm, len(places)), size
@@ -121,17 +121,17 @@ def interpolation(
     nodal: bool,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the interpolation to unknowns, places of the coarse ones that this process has, and those that are held.
+    """Return the interpolation to unknowns, this process's coarse unknowns, and fixed coarse degrees of freedom.
 
-    A coarse cell is an unknown where it holds one.  So is a coarse node if one is interpolated from it, but if what is
-    held lies beside it, only where there is an unknown at the same place.  Then no column depends on others.
+    A coarse cell is an unknown if it contains one. A coarse node is an unknown if an unknown is interpolated from it.
+    Next to a fixed node it must also coincide with an unknown. The columns are then linearly independent.
     """
     rows, coarse, weights = _hats(places, nodal, lines)
     beside = _hats(held, nodal, lines)[1]
-    whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # the weight of what lies at the same place, or in it
+    whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # weight at the same node, or in the coarse cell
     says = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(beside), NOT)])
     among = np.concatenate([coarse, beside])
-    shape = tuple(int(n) for n in over_all(comm, among.max(axis=0, initial=0), MPI.MAX) + 3)  # indices are -1 and more
+    shape = tuple(int(n) for n in over_all(comm, among.max(axis=0, initial=0), MPI.MAX) + 3)  # indices start at -1
     keys, at = np.unique(np.ravel_multi_index((among + 1).T, shape), return_inverse=True)
     said = np.full(len(keys), MAYBE)
     for word in (NOT, IS):
@@ -153,18 +153,18 @@ def interpolation(
 
 
 def _every_other(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lines (m,), m, of the grid of half as many cells; its last cell may reach beyond the grid."""
+    """Return the lines (m,), m, of the grid of half as many cells; its last cell may extend beyond the grid."""
     return x[::2] if len(x) % 2 else np.append(x[::2], 2 * x[-1] - x[-2])
 
 
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return by which weights (m,) which of the fine (m,) are interpolated from which coarse places (m, d + 1)."""
+    """Return fine indices (m,), coarse places (m, d + 1) and weights (m,) of the interpolation."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
-        if lines is not None:  # of the node above it
+        if lines is not None:  # weight of the upper node
             share = np.empty(half.shape)
             for a, x in enumerate(lines):
                 x = np.append(x, 2 * x[-1] - x[-2])
@@ -184,17 +184,17 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, said: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the numbers (n,) of coarse unknowns, NONE where there is none, and which (n,) this process has.
+    """Return the numbers (n,) of coarse unknowns, NONE for others, and whether this process owns them (n,).
 
-    Of the processes that ask for one, that of the least rank has it.  Who that is, and its number, is found out by the
-    process that keys are dealt out to.
+    The process of least rank that asks for an unknown owns it. Keys are distributed over processes to find owners and
+    numbers.
 
     Parameters
     ----------
     keys : (n,)
-        Of what this process asks for, ascending, below `count`.
+        Candidates of this process, ascending, below `count`.
     said : (n,)
-        Whether it is one, by what this process knows: MAYBE, NOT, IS; of several processes the last of these counts.
+        Status of each by the data of this process, MAYBE, NOT or IS; the largest over all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     asked, who = np.unique(ask.send(keys), return_inverse=True)

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""A substep's equations: momentum and storage exchange u and p until both balance.
+"""The equations of a substep: momentum and storage, coupled by u and p.
 
-Parts of the bodies that do not hang together balance each for itself: by its own forces and its own fluid, with steps
-of its own length, until it does.  What others do, and how stiff they are, is nothing to it.
+Unconnected parts of the bodies balance independently: each has its own forces and fluid, and its own step lengths.
+Neither the state nor the stiffness of other parts affects it.
 
 A Newton step of the two problems reads
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p].
 
-`schur-cg` eliminates du and solves with S = C + B K^-1 B^T by conjugate gradients, preconditioned
-with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr), filtered: less beta V for pressures
-that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).  These are two separate
-solvers, accelerated.  `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
-`fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve with C + beta V at frozen stress,
-then a momentum solve, in turn.  Large bodies, of which factors of K cost too much, are solved by multigrid:
-`schur-...` then solve both problems at once, see `monolithic`.
+`schur-cg` eliminates du, and solves with S = C + B K^-1 B^T by conjugate gradients. The preconditioner is the
+fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: less beta V for pressures that alternate
+from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly
+unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: in turn, a storage solve
+with C + beta V at frozen stress, and a momentum solve. Where factors of K are too expensive, in large bodies, multigrid
+is used. `schur-...` then solve both problems at once, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from mpi4py import MPI
 
@@ -40,34 +40,34 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 from mpm_dolfinx.solve.search import FIRM, Halving, Search
 
-INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
+INNER = 1e-3  # momentum tolerance over the storage error: unconverged rotations cause spurious volume changes
 MOMENTUM_STEPS = 10
-REBALANCED = 6  # times the most iterations, in all, of what is to balance with other pressures or pairs of contacts
+REBALANCED = 6  # total iterations with changing contacts, in units of the most iterations
 LOOSEST = 1e-2
-"""Share of a residual that a linear solve leaves at most.
+"""Largest residual after a linear solve, relative to that before it.
 
 Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02.
 """
 SOLVED = 0.05
-"""Share of the tolerance that linear solves leave of the last residual.
+"""Residual after the last linear solve, relative to the tolerance.
 
 Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02.
 """
-SETTLED = 1e-2  # residual from which on what slips on tools may stick: before, what touches them still changes
+SETTLED = 1e-2  # residual below which slipping contacts may stick: above it the contact area still changes
 ERROR = 1 / 20
-"""Share of the estimate of first order, e, that the pressures of a run are taken to be off by.
+"""Assumed pressure error of a run, relative to the first-order estimate e.
 
-Of a mode that decays by l sdirk2 is off by 0.081 dt |l| e in a step, at most 0.28 e, by its stability function; what
-follows a load that varies by at most 0.14 e.  Where little decays in a step such errors add up, to 0.081 e.  Measured,
-against steps an eighth as long: 0.05 to 0.08 e under loads and pressures of drained sides that rise or swing, 0.01 to
-0.04 e with a source that swings, 0.01 to 0.05 e late in a consolidation; 0.17 e in a first step of a load that grows
-from nothing, 0.26 e after one that jumps.  So the largest error of a run is 0.7 to 5 times what this share says.
+For a mode with decay rate l, sdirk2 has an error of 0.081 dt |l| e in a step, at most 0.28 e, by its stability
+function. A pressure that follows a varying load has an error of at most 0.14 e. With little decay in a step such errors
+add up, to 0.081 e. Measured, against steps an eighth as long: 0.05 to 0.08 e under loads and drained pressures that
+rise or oscillate, 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e late in a consolidation; 0.17 e in a first
+step of a load that grows from zero, 0.26 e after a jump. The largest error of a run is thus 0.7 to 5 times this.
 """
 SUDDEN = np.sqrt(2)
 """Change in the second substep over that in the first below which pressures decay so fast that sdirk2 overshoots.
 
-The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2), where the
-changes are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2).  What follows the loads has (1 - gamma) / gamma.
+The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2), where the changes
+are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). Pressures that follow the loads have (1 - gamma) / gamma.
 """
 
 
@@ -79,8 +79,8 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 class Errors:
     """Relative residuals of momentum and storage in the parts of the bodies; arrays (parts,).
 
-    forces: what the first is measured by, N; exchanged: what the second is measured by, the fluid that changes places,
-    m^d; start: forces at the start of the step, N; fluid: the other residual.
+    u, p: relative residuals; forces: scale of the first, N; exchanged: scale of the second, the exchanged fluid volume,
+    m^d; start: forces at the start of the step, N; fluid: residual of the storage.
     """
 
     u: NDArray[np.float64]
@@ -92,12 +92,12 @@ class Errors:
 
     @property
     def each(self) -> NDArray[np.float64]:
-        """The larger one of each part."""
+        """The larger residual of each part."""
         return np.maximum(self.u, self.p)
 
     @property
     def worst(self) -> float:
-        """The largest one."""
+        """The largest residual."""
         return float(self.each.max(initial=0.0))
 
 
@@ -110,20 +110,20 @@ def solve_substep(
     report: Report,
     kept: Kept,
 ) -> Rates | None:
-    """Solve the equations of a substep for (u, p), which the forms then hold; return the rates of the storage.
+    """Solve the equations of a substep for (u, p) in the forms' functions; return the rates of the storage.
 
     Parameters
     ----------
     solvers
-        Of the active set.
+        Solvers of the active set.
     momentum, storage
         The problems; storage is None without fluid.
     as_reset, key
-        See `OnGrid.as_reset`: the tangent of then serves linear laws while the key stays the same.
+        See `OnGrid.as_reset`: its tangent is used for linear laws while the key stays the same.
     report
-        Of the step: what the substep took is added.
+        Report of the step, to which the substep's counts are added.
     kept
-        What the step's tangents share so far.
+        Data shared by the tangents of the step.
 
     Raises
     ------
@@ -161,16 +161,16 @@ def note_pressures(
     dt: float,
     rates: Sequence[Rates],
 ) -> None:
-    """Note what the cells' pressures have done in a step, and the estimated error of it.
+    """Note pressure changes of a step in its report, and the estimated error of the step.
 
-    The difference of the step to one of first order is seconds (Q2 - Q1), a fluid volume.  The fixed-stress operator
-    makes it a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).  Cells count with what they
-    hold.  What the step is off by is taken to be the share ERROR of it.
+    The difference between the step and one of first order is seconds (Q2 - Q1), a fluid volume. The fixed-stress
+    operator turns it into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996). Cells are
+    weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
     Parameters
     ----------
     seconds
-        Time in which the first of the rates counts, s.
+        Time weight of the first rates, s.
     dt
         The step, s.
     """
@@ -211,14 +211,13 @@ class Newton:
         self._storage = storage
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
-        self._functions = [momentum.forms.u] + ([storage.forms.p] if storage is not None else [])
-        systems = [momentum.system] + ([storage.system] if storage is not None else [])
-        self._parts = [system.local_parts for system in systems]
+        forms, active = momentum.forms, momentum.forms.active
+        self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
-        """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
+        """Solve both problems by Newton's method; the tangent is kept while it converges, for linear laws over steps.
 
-        serves: whether the tangent of the substep before may serve.
+        serves: whether the tangent of the previous substep may be used.
         """
         errors, other = self._begin()
         fresh = self._linear or not serves
@@ -231,7 +230,7 @@ class Newton:
         return self._iterations(errors, as_reset, key, fresh)
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p), of these errors; fresh: with its own tangent."""
+        """Iterate from the present (u, p) with these errors; fresh: with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep
@@ -239,7 +238,7 @@ class Newton:
         slow = False
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
-            if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
+            if found is not errors:  # converged, but contacts have changed
                 errors = found
                 count = 0
                 fresh = True
@@ -254,7 +253,7 @@ class Newton:
                 self._solvers.restrain(self._storage)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
-            # inf where no fluid has moved yet
+            # infinite before any fluid has moved
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle()
@@ -263,16 +262,16 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
+        """Return the errors after updates of contact pressures and slip, repeated while the balance holds."""
         momentum = self._momentum
-        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment(errors.forces)):
+        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
             errors = self._errors(errors.start)
         return errors
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are.
+        """Return the errors at the starting point: a guess with a smaller residual than the present (u, p), if any.
 
-        Also where else they may begin, if there is another place.
+        Also return the alternative starting point, if there is one.
         """
         errors, start = self._errors(), self._iterate()
         guesses = [] if self._linear else self._momentum.guesses()
@@ -286,9 +285,9 @@ class Newton:
                 found = self._errors(errors.start)
             except NotConverged:
                 continue
-            better = found.u < least  # of no other p: where no fluid has moved yet the storage tells nothing
+            better = found.u < least  # p is the same, and before any fluid has moved its residual is meaningless
             if better.any():
-                at = guess if better.all() else np.where(better[self._parts[0]], guess, at)
+                at = guess if better.all() else np.where(better[self._parts], guess, at)
                 least, last = np.minimum(found.u, least), at if better.all() else None
         if last is not at:
             self._go_to([at, *start[1:]])
@@ -296,29 +295,35 @@ class Newton:
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
     def _iterate(self) -> list[NDArray[np.float64]]:
-        """Return a copy of the present (u, p), local arrays, m and Pa."""
-        return [f.x.array.copy() for f in self._functions]
+        """Return a copy of the present (u, p) where these are active, m and Pa."""
+        return [f.x.array[rows] for f, rows in self._functions]
+
+    @cached_property
+    def _parts(self) -> NDArray[np.int64]:
+        """Parts of the active degrees of freedom."""
+        momentum = self._momentum
+        return momentum.system.parts.nodes[momentum.forms.active.dofs // momentum.forms.grid.dim]
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
         """Set (u, p)."""
-        for f, values in zip(self._functions, iterate, strict=True):
-            f.x.array[:] = values
+        for (f, rows), values in zip(self._functions, iterate, strict=True):
+            f.x.array[rows] = values
 
     def check_stable(self) -> None:
-        """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.
+        """Refuse an unstable equilibrium: smaller steps find the path that leaves it.
 
-        Its tangent has negative eigenvalues.  Without water only, which holds a buckling body back for a while.
-        Where a step kept its first tangent, it is the next step that finds out.
+        Its tangent has negative eigenvalues. The check is for dry bodies only, because water delays buckling. If a step
+        has kept its first tangent, the next step finds out.
         """
         if not negative_pivots(self._solvers.solve_u):
             return
-        self._linearise()  # the last tangent may be that of another state
+        self._linearise()  # the last tangent may belong to another state
         if count := negative_pivots(self._solvers.solve_u):
             why = f"the equilibrium is unstable, its tangent has {count} negative eigenvalues"
             raise NotConverged(why, self.report.history)
 
     def alternate(self) -> Errors:
-        """Fixed-stress iteration: momentum at fixed pressure, then storage at fixed stress, until both balance."""
+        """Fixed-stress iteration: momentum at fixed pressure, then storage at fixed stress, until both converge."""
         errors, report = self._errors(), self.report
         self._linearise()
         while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
@@ -340,7 +345,7 @@ class Newton:
         return errors
 
     def _balance_momentum(self, errors: Errors) -> None:
-        """Newton's method on the momentum at fixed pressure."""
+        """Solve the momentum by Newton's method at fixed pressure."""
         goal = INNER * max(self._scheme.tolerance, min(1.0, errors.p.max()))
         for count in range(MOMENTUM_STEPS):
             if count and errors.u.max() <= goal:
@@ -360,10 +365,10 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals; return and note their norms relative to their scales.
 
-        start (parts,): forces at the start of the step, N.  Those of other iterates do not count: after one that has
-        gone far astray everything would seem to balance.
+        start (parts,): forces at the start of the step, N. Forces of other iterates do not enter the scale: after a
+        diverging iterate every residual would seem small.
 
-        What is round-off counts as 0.  It is noted as it is, relative to no less than what makes it the tolerance.
+        Round-off counts as 0. The noted residual includes it, with a scale of at least round-off over tolerance.
         """
         first = not self.report.history
         with Timer("mpm: residual"):
@@ -387,12 +392,12 @@ class Newton:
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
-        """Set the tangent at the present (u, p), which no other step is to use; firmness: see `LinearSolvers`."""
+        """Set the tangent at the present (u, p), which is not kept for other steps; firmness: see `LinearSolvers`."""
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
     def _linearise_as_reset(self, as_reset: AsReset) -> bool:
-        """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
+        """Set the tangent at the state of the last reset of the grid, however many steps ago."""
         with as_reset() as pieces:
             if self._storage is not None:
                 self._storage.set_fluxes()
@@ -401,20 +406,20 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem; return the coupling iterations.
 
-        slow: whether the last step has gained little although its tangent was its own: that leaves out what the fluxes
-        gain by displacements.
+        slow: whether the last step converged slowly with its own tangent, which lacks the derivative of fluxes by
+        displacements.
         """
-        # no more accuracy than the next residual can use
+        # no more accurate than the next residual needs
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
         if self._momentum.linear and not (iterative and self._momentum.forms.grid.dim == 3):
             least = 0.0
         rtol = min(LOOSEST, max(least, SOLVED * self._scheme.tolerance / min(1.0, errors.worst)))
-        if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
+        if iterative:  # the penalty of prescribed displacements dominates the first residual and hides the rest
             rtol = max(SOLVED * self._scheme.tolerance, rtol / max(1.0, errors.worst))
         if self._storage is not None:
             rtol = min(rtol, self._storage.accuracy)
         done = errors.each <= self._scheme.tolerance
-        if done.any():  # what balances stays where it is
+        if done.any():  # converged parts do not move
             self._momentum.system.residual.array_w[done[self._momentum.system.of_parts.of]] = 0.0
             if self._storage is not None:
                 errors.fluid.vector.array_w[done[self._storage.system.of_parts.of]] = 0.0
@@ -426,13 +431,14 @@ class Newton:
             measures = forces, np.maximum(errors.exchanged, least)
             if not slow or self._linear or self._storage.forms.retains:
                 return self._solvers.solve(self._kept, rtol, *measures)
-            slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
+            forms = self._momentum.forms
+            slope = self._storage.flux_slope(forms.u, self._momentum.system.unknowns, forms.active.dofs)
             count = self._solvers.solve(self._kept, rtol, *measures, slope)
             self._storage.set_fluxes()
             return count
 
     def _line_search(self, before: Errors, elastic: bool) -> Errors:
-        """Go against the direction, each part as far as `search` says; return the errors there."""
+        """Move against the direction, each part by the step length of `search`; return the errors there."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
         first = self._work()
@@ -461,7 +467,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors) -> tuple[Errors, NotConverged | None]:
-        """Return the errors where a step has led, infinite where a law cannot be evaluated; and why it cannot."""
+        """Return the errors after a trial step, infinite where a law cannot be evaluated, and the exception, if any."""
         try:
             return self._errors(before.start), None
         except NotConverged as failed:
@@ -472,7 +478,7 @@ class Newton:
     def _work(self) -> NDArray[np.float64]:
         """Return the work (parts,), J, of both residuals along the direction.
 
-        That of the coupling cancels in their sum, so the tangent alone makes it: see `search`.
+        The coupling terms cancel in the sum, so the work depends on the tangent blocks alone: see `search`.
         """
         system = self._momentum.system
         work = system.of_parts.sums(system.residual.array_r * self._solvers.du.array_r)
@@ -482,7 +488,7 @@ class Newton:
         return work + system.of_parts.sums(system.residual.array_r * self._solvers.dp.array_r)
 
     def _move(self, steps: NDArray[np.float64]) -> None:
-        """Move the parts by shares (parts,) of the direction."""
+        """Move the parts by fractions (parts,) of the direction."""
         with _ignored():
             system = self._momentum.system
             system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
@@ -492,10 +498,10 @@ class Newton:
 
 
 def _ignored() -> np.errstate:
-    """Return what ignores that a solve has failed: the residual tells."""
+    """Return a context without floating-point warnings: the residual reveals a failed solve."""
     return np.errstate(invalid="ignore", over="ignore")
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Return part / whole, nan where that is not finite."""
+    """Return part / whole, nan where it is not finite."""
     return part / whole if whole and np.isfinite(part) else np.nan

@@ -21,24 +21,25 @@ class Numerics:
     Parameters
     ----------
     quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, of boxes, not in
-        axisymmetry.
+        "domain": exact integration over cut particle domains; "point": at the points, as in standard MPM; boxes only,
+        no axisymmetry.
     coupling
-        How momentum and storage are coupled, one of `COUPLINGS`.
+        Coupling scheme of momentum and storage, one of `COUPLINGS`.
     tolerance
-        Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
+        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume; in (0, 1).
     method
-        Of time integration: "sdirk2", of second order, or "backward-euler".
+        Time integration: "sdirk2", of second order, or "backward-euler".
     renewal
-        Whether domains of yielded soil that have become longer than a cell are renewed, see `stepping/renewal.py`:
-        of dry soil in plane strain, on equal cells, without inertia and groups, with `quadrature="domain"`.
+        Whether to renew particle domains of yielded soil that have become longer than a cell, see
+        `stepping/renewal.py`. It needs dry soil in plane strain, equal cells, no inertia, no groups, and
+        `quadrature="domain"`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.
 
     Raises
     ------
     ValueError
-        Naming what is none that is allowed.
+        An invalid option; the message names it and the allowed values.
     """
 
     quadrature: str = "domain"
@@ -53,11 +54,11 @@ class Numerics:
             raise ValueError(f"quadrature {self.quadrature!r}: must be {' or '.join(QUADRATURES)}")
         substeps(self.method, True)
         flag("renewal", self.renewal)
-        _ = self.scheme  # refuses what is none
+        _ = self.scheme  # checks coupling, tolerance and options
 
     @property
     def scheme(self) -> Scheme:
-        """How the two problems are coupled, and how exactly they are solved."""
+        """Coupling scheme of the two problems, with its tolerance."""
         return Scheme(self.coupling, self.tolerance, petsc_options=self.petsc_options)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""PETSc's options for the solvers: those of the package, and those of the user's in their place.
+"""PETSc's options for the solvers: defaults of the package, and options of the user, which replace them.
 
-Names begin with that of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line with "mpm_" before it.
+Names begin with the prefix of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line with "mpm_" before it.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ PREFIXES = {
     "momentum_multigrid_": "multigrid on K",
     "nodal_factors_": "factors of K in blocks",
     "storage_": "conjugate gradients or FGMRES on the Schur complement, with factors of the fixed-stress operator",
-    "storage_gathered_": "these factors on the one of several processes that has them",
+    "storage_gathered_": "these factors, if one of several processes holds them",
     "storage_multigrid_": "multigrid on the fixed-stress operator",
     "block_": "GMRES on displacements and pressures at once",
     "factors_": "factors of K that replace multigrid cycles",
-    "storage_factors_": "factors of the fixed-stress operator that do",
+    "storage_factors_": "factors of the fixed-stress operator that replace multigrid cycles",
 }
-"""What names of options begin with, and the solver that this is."""
+"""Prefixes of options, and their solvers."""
 
 
 def check(options: Mapping[str, Any]) -> None:
-    """Raise a ValueError for a name that begins as that of no solver."""
+    """Raise a ValueError for a name without the prefix of a solver."""
     for name in options:
         if not isinstance(name, str) or not name.startswith(tuple(PREFIXES)):
             raise ValueError(f"petsc_options {name!r}: must begin with one of {', '.join(PREFIXES)}")
@@ -36,12 +36,12 @@ def check(options: Mapping[str, Any]) -> None:
 
 @contextmanager
 def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterator[None]:
-    """Give PETSc options of the user's while solvers are made; remove from `unread` those that these read."""
+    """Set the user's PETSc options while solvers are created; remove the options that they read from `unread`."""
     given, before = PETSc.Options(), {}
     for name, value in options.items():
         full = f"mpm_{name}"
         before[full] = given.getString(full) if given.hasName(full) else None
-        given.delValue(full)  # looking for it has marked it as read
+        given.delValue(full)  # the query above has marked it as read
         given.setValue(full, value)
     try:
         yield
@@ -53,7 +53,7 @@ def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterato
 
 
 def set_defaults(solver: PETSc.KSP, values: Mapping[str, Any]) -> None:
-    """Set options of a solver that the user has not."""
+    """Set options of a solver that the user has not set."""
     options = PETSc.Options(solver.getOptionsPrefix())
     for name, value in values.items():
         if not options.hasName(name):
@@ -61,7 +61,7 @@ def set_defaults(solver: PETSc.KSP, values: Mapping[str, Any]) -> None:
 
 
 def _read(name: str) -> bool:
-    """Return whether PETSc has read an option; petsc4py does not tell."""
+    """Return whether PETSc has read an option; petsc4py has no function for it."""
     found = ctypes.c_int()
     ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(found))
     return bool(found.value)

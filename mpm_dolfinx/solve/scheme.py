@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How momentum and storage are coupled."""
+"""Coupling schemes of momentum and storage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes and the multiple of alpha^2/K_dr that they take as beta; None: 1/K_w."""
+"""Coupling schemes, with beta as a multiple of alpha^2/K_dr; None: 1/K_w."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class Scheme:
     coupling
         Name in `COUPLINGS`.
     tolerance
-        Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
+        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume; in (0, 1).
     most_newton, most_coupling
-        Newton steps, or coupling iterations of `fixed-stress`, before a step is given up.
+        Most Newton steps, or coupling iterations of `fixed-stress`, in a step.
     petsc_options
         PETSc's options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
-        `petsc_options.PREFIXES`.  A warning names those that no solver of the scene reads.
+        `petsc_options.PREFIXES`. A warning lists options that no solver of the scene reads.
 
     Raises
     ------
     ValueError
-        Naming what is out of its range.
+        A value out of its range; the message names it.
     """
 
     coupling: str

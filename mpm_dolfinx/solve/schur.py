@@ -4,12 +4,12 @@
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
 
-du is eliminated: S = C + B K^-1 B^T is solved with by conjugate gradients (or FGMRES), preconditioned with the
-fixed-stress operator.  Of large bodies both are solved for at once, see `monolithic`.
+Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S, preconditioned with the
+fixed-stress operator. For large bodies both unknowns are solved for at once, see `monolithic`.
 
-PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, ends with the same
-digits, and takes 0.8 to 1 of the time of a solve.  It wants a copy of -B^T at each tangent, and fixed-stress iterations
-would still need the parts.
+PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, gives the same
+digits, and takes 0.8 to 1 of the time of a solve. It needs a copy of -B^T at each tangent, and fixed-stress iterations
+would still need the blocks.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return how problems with these matrices are solved; symmetric: whether the momentum's tangent is."""
+    """Return the solver plan of problems with these matrices; symmetric: whether the momentum's tangent is."""
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
@@ -63,11 +63,11 @@ class SchurComplement:
     storage
         The matrices.
     solve
-        Solves with K.
+        Solver with K.
     f, v
-        Two vectors of displacements.
+        Two displacement vectors.
     slopes
-        What the fluxes gain by displacements, if that counts.
+        Derivative of the fluxes by displacements, if it is included.
     """
 
     storage: StorageSystem
@@ -87,14 +87,14 @@ class SchurComplement:
 
 @dataclass
 class Kept:
-    """What the tangents of a step share, so far; the next step begins with none of it.
+    """Data shared by the tangents of a step; each step starts without any.
 
     Parameters
     ----------
     operator
-        Whether the fixed-stress operator has factors that serve.
+        Whether the factors of the fixed-stress operator are still valid.
     factors
-        Those that take the place of multigrid cycles, if any do.
+        Factors that replace multigrid cycles, if any.
     """
 
     operator: bool = False
@@ -102,14 +102,14 @@ class Kept:
 
 
 class LinearSolvers:
-    """Solvers for the matrices of one active set, complete when made.
+    """Solvers for the matrices of one active set.
 
     Parameters
     ----------
     how
         The plan, as `planned`.
     scheme
-        How the two problems are coupled.
+        Coupling scheme.
     momentum, storage
         Matrices and vectors; storage is None without fluid.
     """
@@ -120,24 +120,24 @@ class LinearSolvers:
         self._momentum = momentum
         self._storage = storage
         self.tangent: Latest[bool] = Latest()
-        """What the matrices hold the tangent of, where it is kept."""
+        """Key of a tangent that the matrices keep over steps."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
-        """Direction of the displacements."""
+        """Direction of the displacements, and a right-hand side."""
         self._unread = set(scheme.petsc_options)
         with using(scheme.petsc_options, self._unread):
             self.solve_u = self._momentum_solver()
             if storage is None:
                 return
             self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
-            """Direction of the pressures."""
+            """Direction of the pressures, and a right-hand side."""
             if how.route == AT_ONCE:
                 self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), False, how.coarsest)
                 self._block = BlockSolver(how, momentum, storage, (self.solve_u.pc, self._solve_s.pc))
                 return
             work = momentum.unknowns.vector(), momentum.unknowns.vector()
             n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u, *work)
-            finalize(self, vars(self._context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
+            finalize(self, vars(self._context).clear)  # PETSc keeps contexts of matrices and their references
             self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
             self._schur.setUp()
             mumps = how.pressures == MUMPS
@@ -150,7 +150,7 @@ class LinearSolvers:
             self._krylov = self._solve_s.getType()
 
     def _momentum_solver(self) -> PETSc.KSP:
-        """Return what solves for displacements."""
+        """Return the solver for displacements."""
         how = self.plan
         K = self._momentum.K
         unknowns = self._momentum.unknowns
@@ -160,14 +160,14 @@ class LinearSolvers:
         return displacement_solver(K, "momentum", unknowns, how.displacements, how.symmetric)
 
     def _set_krylov(self, kind: str) -> None:
-        """Let this iterative solver solve for the pressures."""
+        """Set the type of the iterative solver for the pressures."""
         if self._solve_s.getType() != kind:
             self._solve_s.setType(kind)
             self._solve_s.setGMRESRestart(MOST)
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement, and the solver with its preconditioner; ValueError where there is none."""
+        """The Schur complement, and its preconditioned solver; ValueError if the plan has none."""
         if self._schur is None:
             raise ValueError("solvers: multigrid solves for displacements and pressures at once, must be factors")
         return self._schur, self._solve_s
@@ -180,16 +180,16 @@ class LinearSolvers:
         data: QuadratureData | None = None,
         firmness: NDArray[np.float64] | float = 0.0,
     ) -> bool:
-        """Set the tangents at (u, p), of the problems' pieces or of others, and factorise them.
+        """Assemble the tangents at (u, p), at the problems' integration points or others, and factorise them.
 
         Parameters
         ----------
         kept
-            What the step's tangents share so far.
+            Data shared by the tangents of the step.
         data
-            Other pieces.
+            Other integration points.
         firmness
-            Share of the elastic shear stiffness that is added, one number or one for each part.
+            Added fraction of the elastic shear stiffness, one number or one for each part.
         """
         kept = kept or Kept()
         with Timer("mpm: tangent"):
@@ -213,13 +213,13 @@ class LinearSolvers:
                     P = storage.assemble_preconditioner(self.scheme.beta, share)
                     self._solve_s.setOperators(self._schur, P)
                 factorise(self.solve_u.pc, self._solve_s.pc)
-                # what a resumed run may not have any more serves no other tangent
+                # no factors may be kept that a resumed run would lack
                 kept.operator = not self.scheme.richardson and data is None
         self._tell_unread()
         return True
 
     def _tell_unread(self) -> None:
-        """Warn of options that no solver has read: once all are made."""
+        """Warn of options that no solver has read, after all solvers have been created."""
         if not self.scheme.petsc_options:
             return
         comm = self.du.comm.tompi4py()
@@ -241,13 +241,13 @@ class LinearSolvers:
         Parameters
         ----------
         kept
-            What the step's tangents share so far.
+            Data shared by the tangents of the step.
         rtol
             Relative accuracy of each part.
         forces, exchanged : (parts,)
-            What the residuals are measured by: forces, N, and fluid that changes places, m^d.
+            Scales of the residuals: forces, N, and exchanged fluid volume, m^d.
         slope
-            What the fluxes gain by displacements; without, the tangent leaves that out.
+            Derivative of the fluxes by displacements, if the tangent includes it.
         """
         slopes = () if slope is None else (slope,)
         if self._storage is None:
@@ -256,7 +256,7 @@ class LinearSolvers:
             count = solved(self.solve_u, "momentum")
             return count if self.plan.iterative else 0
         if self._block is not None:
-            r = self._storage.residual  # scales of Euclidean norms that make them the errors
+            r = self._storage.residual  # scales with which Euclidean norms equal the errors
             of = self._storage.of_parts
             size, total = of.norms(r.array_r), of.sums(np.abs(r.array_r))
             share = np.divide(size, total, out=np.ones(of.count), where=total > 0)
@@ -269,7 +269,7 @@ class LinearSolvers:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))
         g = self.condense(*slopes)
         self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
-        cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # which takes preconditioned norms
+        cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # it uses preconditioned norms
         self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply if cg else None)
         self._schur.setPythonContext(self._context)
         self._follow()
@@ -285,9 +285,9 @@ class LinearSolvers:
         of: OfParts,
         measured: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
     ) -> None:
-        """Solve for x iteratively, so that all parts are as accurate: nothing couples them, so each may have a scale.
+        """Solve iteratively for x, with equal accuracy in all parts: each uncoupled part may have its own scale.
 
-        measured: makes of the right-hand side b what the solver takes the norm of; None: b itself.
+        measured: maps the right-hand side b to the vector whose norm the solver takes; None: b itself.
         """
         if of.count <= 1:
             ksp.solve(b, x)
@@ -302,7 +302,7 @@ class LinearSolvers:
         x.array_w[:] *= scale
 
     def restrain(self, storage: StorageProblem) -> None:
-        """Let pressures fall by no more along the direction than their storage says, displacements as these ask."""
+        """Limit the fall of pressures along the direction as the storage requires, and adapt the displacements."""
         dp = storage.restrained(self.dp.array_r)
         far = not np.array_equal(dp, self.dp.array_r)
         if not self.du.comm.tompi4py().allreduce(far, MPI.LOR):
@@ -318,7 +318,7 @@ class LinearSolvers:
         self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
-        """Turn the direction round, of all parts or of some (parts,)."""
+        """Reverse the direction in all parts, or in some (parts,)."""
         directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
         for direction, system in directions:
             if parts is None or parts.all():
@@ -327,20 +327,20 @@ class LinearSolvers:
                 direction.array_w[:] *= np.where(parts, -1.0, 1.0)[system.of_parts.of]
 
     def condense(self, *slopes: FluxSlope) -> PETSc.Vec:
-        """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
+        """Return the right-hand side of the Schur complement's system, R_p - B K^-1 R_u."""
         self.solve_u.solve(self._momentum.residual, self.du)
         self._storage.lost(self.du, self._g, *slopes)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures, Pa, that the fixed-stress operator makes of fluid volumes of the owned cells, m^d."""
+        """Return the pressures, Pa, of the fixed-stress operator for fluid volumes of the owned cells, m^d."""
         self._g.array_w[:] = volumes
         self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r
 
     def solve_momentum(self) -> None:
-        """Solve for du alone, pressures kept."""
+        """Solve for du alone, at fixed pressure."""
         if self._storage is not None:
             self.dp.set(0.0)
         if self.plan.iterative:
@@ -349,6 +349,6 @@ class LinearSolvers:
             self.solve_u.solve(self._momentum.residual, self.du)
 
     def solve_storage(self) -> PETSc.Vec:
-        """Return dp, solved for at fixed stress."""
+        """Return dp at fixed stress."""
         self._solve_s.solve(self._storage.residual, self.dp)
         return self.dp

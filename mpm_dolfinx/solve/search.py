@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""How far a Newton step goes.
+"""Line search: the length of a Newton step.
 
-Where nothing yields it goes all the way, also if the residual grows: rotations of a body that bends stretch it at first
-order.  It is halved while a law cannot be evaluated at its end, or the residual explodes.
+Without yield the step is full, even if the residual grows: rotations of a bending body cause a spurious stretch at
+first order. It is halved while a law cannot be evaluated at its end, or the residual explodes.
 
-Where soil yields a step is full if the residual falls, or if the forces do less work along it at its end than half of
-that at its start; else it goes to about where they do none (Matthies and Strang 1979): there points that it unloads
-leave their yield surface, and the next tangent is as stiff as they are.  Work is that of the forces and of the fluid:
-that of the forces alone is next to none where these balance and the fluid does not.  Shorter steps, with lower
-residuals, would be followed by ones as short.  Bracketed secants find it.  Soil that has lost its strength needs
-several: with one, a bank that slumps takes twice the Newton steps.
+In yielding soil the step is full if the residual falls, or if the forces at its end do less than half of the initial
+work along it. Otherwise the search ends where they do about none (Matthies and Strang 1979). Points that the step
+unloads leave their yield surface there, and the next tangent is as stiff as they are. The work includes that of the
+fluid: the work of the forces alone nearly vanishes where these are in equilibrium and the fluid is not. Shorter steps
+with smaller residuals would lead to more short steps. Bracketed secants find the point. Soil that has lost its strength
+needs several: with one, a slumping bank takes twice the Newton steps.
 
-Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
-steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual of the forces is
-large, holds them back (Levenberg 1944, Marquardt 1963).  The residual of the fluid, which grows with the length of a
-step, says nothing of the soil.  Soil that has not yielded gets the share too: where it does so for the first time it
-flows as far.  Only while nothing has yielded before, and the tangents serve on, they stay as they are: wet elastic soil
-takes 1.6 times the Newton steps with firmer ones.
+Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
+overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
+residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid does not count: it grows with the
+step length, and says nothing about the soil. Soil that has not yielded is regularised too: it flows as far when it
+first yields. There is no regularisation before the first yield while the tangents converge: it would cost wet elastic
+soil 1.6 times the Newton steps.
 
-Where a few points flow and their tangent has less than no stiffness, Newton's direction leads backwards: it unloads
-them, the next step loads them again, and the iterations circle between the two.  There the residuals do negative work
-along it, and the step goes the other way.
+A few flowing points may have a tangent with negative stiffness. Newton's direction then leads backwards: it unloads
+them, the next step loads them again, and the iterations cycle. The residuals do negative work along it, and the step is
+reversed.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from dataclasses import dataclass
 import numpy as np
 
 EXPLODES, SHORTEST = 1e4, 1e-3
-"""Growth of the residual from which on a step is halved where nothing yields, and the least share of it.
+"""Growth of the residual at which a step is halved without yield, and smallest fraction of the step.
 
 With 1e3 and 1e5 scenes take the same steps: the growth is below them, or the residual not finite.
 """
 WORK = 0.5
-"""Work along a step, over that at its start, that it may end with (Matthies and Strang 1979)."""
+"""Largest work at the end of a step, over that at its start (Matthies and Strang 1979)."""
 FIRM = 0.1
-"""Share of the elastic shear stiffness over the residual, at most 1, that is added to a tangent where soil yields.
+"""Fraction of the elastic shear stiffness in the tangent of yielding soil, over the relative residual, at most 1.
 
 With 0.05 and 0.2 a footing on 9 cells takes 291 and 293 Newton steps, pushed ground 42 and 43, with 0.1 293 and 41.
 """
@@ -46,24 +46,24 @@ With 0.05 and 0.2 a footing on 9 cells takes 291 and 293 Newton steps, pushed gr
 
 @dataclass(frozen=True)
 class Halving:
-    """Search where nothing yields; step: the share to try."""
+    """Search without yield; step: the next trial, as a fraction of the full step."""
 
     step: float = 1.0
     limit = EXPLODES
-    """What the residual may have grown by at its end."""
+    """Largest growth of the residual at the end."""
 
     def after(self, work: float, growth: float) -> Halving | None:
-        """Return the next step to try after one with which the residual grows by a factor; None: it has ended."""
+        """Return the next trial after one that multiplies the residual by `growth`; None: the search has ended."""
         ends = growth <= self.limit or self.step < 2 * SHORTEST
         return None if ends else Halving(0.5 * self.step)
 
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step at whose end the residuals do less work than half of that at its start.
+    """Search for a step at whose end the residuals do less than half of the initial work.
 
-    step: the one to try; low, high: steps between which the work changes its sign; at_low, at_high: the work there,
-    over that at the start; ends: whether the next step is the last one.
+    step: the next trial; low, high: steps between which the work changes its sign; at_low, at_high: work there over the
+    initial work; ends: whether the next step is the last one.
     """
 
     step: float = 1.0
@@ -73,13 +73,13 @@ class Search:
     at_high: float = np.nan
     ends: bool = False
     limit = sys.float_info.max
-    """What the residual may have grown by at its end."""
+    """Largest growth of the residual at the end."""
 
     def after(self, work: float, growth: float) -> Search | None:
-        """Return the next step to try after one that ends with such a work, nan if that is not finite; None: none.
+        """Return the next trial after one with this relative work, nan if it is not finite; None: the search has ended.
 
-        growth: of the residual.  If a full step does not raise it, it is enough that the residuals do no more work than
-        at its start.  A secant gives the next step; the middle does where a bound stays for a second time.
+        growth: of the residual. A full step that does not increase the residual may end with up to the initial work. A
+        secant gives the next trial; bisection does where a bound stays for a second time.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

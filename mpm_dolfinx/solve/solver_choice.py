@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The choice of solvers: one function of what a problem is, and the one table of where routes cross.
+"""The choice of solvers: a function of the problem's properties, and the table of thresholds between routes.
 
-Four routes lead through the linearised problem.  Without fluid the momentum is solved alone.  With fluid displacements
-are eliminated (`schur`), both problems are solved at once (`monolithic`), or in turn (fixed-stress iterations).
-Displacements have factors, a block a node, by PETSc or MUMPS, or multigrid cycles.
+There are four routes for the linearised problem. Without fluid the momentum is solved alone. With fluid the
+displacements are eliminated (`schur`), or both problems are solved at once (`monolithic`) or in turn (fixed-stress
+iterations). Displacements have direct solvers, with a block for each node, by PETSc or MUMPS, or multigrid cycles.
 """
 
 from __future__ import annotations
@@ -11,36 +11,36 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by MUMPS", "multigrid"
-"""Ways to solve for displacements or pressures."""
+"""Solvers for displacements or pressures."""
 ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at once", "in turn"
-"""Ways through the linearised problem."""
+"""Routes for the linearised problem."""
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Where one route becomes better than another; `bash demos/run.sh calibrate` times both sides of each.
+    """Thresholds between routes; `bash demos/run.sh calibrate` times both sides of each.
 
     multigrid_3d
-        Unknown displacements in 3D from which on multigrid solves.  Seconds of five load steps of a square beam by
-        factors and by multigrid: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4 with 2600, 8.2 and 2.1 with 4900.
+        Unknown displacements in 3D from which multigrid solves. Five load steps of a square beam take, by factors and
+        by multigrid, s: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4 with 2600, 8.2 and 2.1 with 4900.
     multigrid_2d
-        The same in wet 2D scenes in which nothing yields.  Linear algebra of a step of the beam, s: 0.06 and 0.05 with
-        10400 unknowns, 0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
+        The same in wet 2D scenes without yield. Linear algebra of a step of the beam takes, s: 0.06 and 0.05 with 10400
+        unknowns, 0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
     mumps
-        Unknown displacements of wet unsymmetric problems from which on MUMPS makes factors, on all processes.  Seconds
-        of factors of K and of a solve with 196000 unknowns: PETSc 2.6 and 0.02, MUMPS with OpenBLAS 0.7 and 0.09; with
-        51000 unknowns 0.25 and 0.004, 0.12 and 0.02.  A Newton step takes five to ten solves.
+        Unknown displacements of wet unsymmetric problems from which MUMPS makes factors, on all processes. Factors of K
+        and a solve take, with 196000 unknowns, s: PETSc 2.6 and 0.02, MUMPS with OpenBLAS 0.7 and 0.09; with 51000
+        unknowns 0.25 and 0.004, 0.12 and 0.02. A Newton step takes five to ten solves.
     gathering
-        Processes up to which one of them has the factors that are used often: all of four making both, which share the
-        memory's bandwidth, took 1.7 times as long.
+        Most processes with which one holds the factors for many solves. Making both factors on all of four processes,
+        which share the memory's bandwidth, took 1.7 times as long.
     fallback_3d
-        Unknown displacements in 3D up to which factors may replace cycles.  MUMPS takes 8 s and 0.2 GB for as many,
-        where K is not symmetric 15 s and 0.4 GB.
+        Most unknown displacements in 3D with which factors may replace cycles. MUMPS takes 8 s and 0.2 GB for this
+        number, with unsymmetric K 15 s and 0.4 GB.
     many
-        Iterations of a solve after which factors replace the cycles, or the next tangent has factors of its own
-        fixed-stress operator.  The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
+        Iterations of a solve after which factors replace the cycles, or the next tangent renews the factors of the
+        fixed-stress operator. The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
     coarsest
-        Unknowns of a grid that is solved on by factors.
+        Unknowns of a grid up to which factors solve on it.
     """
 
     multigrid_3d: int = 1500
@@ -54,19 +54,19 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Share of a residual that a linear solve leaves at least.
+"""Tightest relative tolerance of a linear solve.
 
 Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02.
 """
 FORCING_3D = 1e-3
-"""The same of cycles in 3D, by multigrid."""
+"""The same for multigrid in 3D."""
 KEEP = 0.05
-"""Residual over the one before up to which a tangent is kept for the next step.
+"""Largest ratio of successive residuals at which the tangent is kept for the next step.
 
 Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02.
 """
 KEEP_WET = 0.01
-"""The same in wet 2D scenes in which nothing yields.
+"""The same in wet 2D scenes without yield.
 
 Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02.
 """
@@ -74,32 +74,32 @@ Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02.
 
 @dataclass(frozen=True)
 class SolverPlan:
-    """How the linearised problem is solved.
+    """The solution method of the linearised problem.
 
     Parameters
     ----------
     route
         One of `ALONE`, `SCHUR`, `AT_ONCE`, `IN_TURN`.
     displacements, pressures
-        What stands for the inverses of K and of the fixed-stress operator; pressures is "" without fluid.
+        Solvers for K and for the fixed-stress operator; pressures is "" without fluid.
     krylov
-        Type of the iterative solver by PETSc's name, "preonly" where factors alone solve.
+        PETSc's name of the iterative solver, "preonly" for factors alone.
     fallback
-        Factors that replace a cycle on K which takes many iterations; "" where none may.
+        Factors that replace a cycle on K after many iterations; "" for none.
     firmly
-        Whether cycles smooth three times as often: volumes hardly change, and no factors may help.
+        Whether cycles smooth three times as often: for nearly incompressible bodies without a fallback.
     gathered
-        Whether one process has the factors.
+        Whether one process holds the factors.
     symmetric
-        Whether the tangent of the momentum is.
+        Whether the tangent of the momentum is symmetric.
     many
-        Iterations of a solve after which other factors are made: see `Thresholds`.
+        Iterations of a solve after which new factors are made: see `Thresholds`.
     coarsest
-        Unknowns of a grid that is solved on by factors.
+        Unknowns of a grid up to which factors solve on it.
     forcing
-        Least relative accuracy of a linear solve; see `plan`.
+        Tightest relative tolerance of a linear solve; see `plan`.
     keep
-        A tangent serves on while a Newton step leaves less than this share of the residual; see `plan`.
+        Largest ratio of successive residuals at which the tangent is kept; see `plan`.
     """
 
     route: str
@@ -117,7 +117,7 @@ class SolverPlan:
 
     @property
     def iterative(self) -> bool:
-        """Whether a multigrid cycle stands for K^-1, not factors."""
+        """Whether a multigrid cycle approximates K^-1, in place of factors."""
         return self.displacements == MULTIGRID
 
     def __str__(self) -> str:
@@ -143,14 +143,15 @@ def plan(
     processes: int = 1,
     coupling: str = "schur-cg",
 ) -> SolverPlan:
-    """Return how to solve a problem.
+    """Return the solution method of a problem.
 
-    The tangent is kept while a Newton step reduces the residual to less than 0.05, to 0.01 in 2D, wet and elastic.  The
-    seed beam in 26 steps by error: 205 steps and 79 tangents with 0.05, 179 and 83 with 0.01, 174 and 94 with 0.002.
-    In 3D, where tangents cost more, a beam takes up to a fifth longer with 0.01.
+    The tangent is kept while a Newton step reduces the residual to less than 0.05 of it, to 0.01 in 2D, wet and
+    elastic. The seed beam in 26 adaptive steps takes 205 Newton steps and 79 tangents with 0.05, 179 and 83 with 0.01,
+    174 and 94 with 0.002. In 3D, where tangents cost more, a beam takes up to a fifth longer with 0.01.
 
-    Linear solves go to 1e-5, by multigrid in 3D to 1e-3.  With factors an iteration is cheap, and what a solve leaves
-    of the fluid's residual costs a Newton step: a footing on 21 cells (backward Euler) takes 299, 370 with 1e-3.
+    The relative tolerance of linear solves is at least 1e-5, with multigrid in 3D 1e-3. With factors an iteration is
+    cheap, and a looser solve of the fluid's residual costs a Newton step: a footing on 21 cells (backward Euler) takes
+    299, 370 with 1e-3.
 
     Parameters
     ----------
@@ -161,11 +162,11 @@ def plan(
     wet
         Whether there is fluid.
     yields, locks
-        Whether any law may yield; whether any does or hardly changes its volume.
+        Whether any law may yield; whether any yields or is nearly incompressible.
     symmetric
-        Whether the tangent of the momentum is.
+        Whether the tangent of the momentum is symmetric.
     processes
-        Their number.
+        Number of processes.
     coupling
         Name in `scheme.COUPLINGS`.
     """

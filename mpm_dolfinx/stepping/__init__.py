@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""A step: the scene, its state, stages, and the algorithm."""
+"""The step: scene, state, stages, and the algorithm."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The end of a step: domains move with the grid, F is what their corners tell, and pressures travel along.
+"""The end of a step: particle domains move with the grid, F follows from their corners, and pieces carry the pressures.
 
 The grid itself is reset at the start of the next step, see `grid_reset`.
 """
@@ -44,13 +44,13 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay
 
 TAKES_IN = 0.1
-"""Rate at which steps take in the difference `owed` of content and fluid, per cell that a corner of the part has moved.
+"""Rate of correction of the volume defect `owed` of points, per cell of corner motion in their part of the bodies.
 
-Of its mean over a part that nothing drains or feeds all is taken in: such a part keeps its volume.  With 0, 0.1, 0.2
-and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress; from 0.2 on
-pressures of a manufactured solution converge with less than order 1.75.  Where hardly anything moves nothing is taken
-in, so the orders in time are those of the method.  To take in the mean of parts that drain would be wrong: it made a
-column under a gravity of time converge with order 1.2 in the step.
+The mean defect of an undrained part without sources is corrected at once: such a part keeps its volume. With 0, 0.1,
+0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress. From 0.2 on
+pressures of a manufactured solution converge with less than order 1.75. Without motion there is no correction, so it
+does not affect the order in time. The mean of drained parts must stay: a column under a varying gravity then has order
+1.2 in the step.
 
 Plateau (beam): halved 1.7e-03, doubled 2.8e-03, cells 1.5e-02.
 """
@@ -66,7 +66,7 @@ class Motion:
     bodies
         All bodies of the scene.
     momentum, storage
-        Forms of the two problems, which hold the u and p of a solved step; storage is None without fluid.
+        Forms of the two problems, with u and p of a solved step; storage is None without fluid.
     """
 
     def __init__(
@@ -94,29 +94,29 @@ class Motion:
         stays: bool = True,
         carried: Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None = None,
     ) -> tuple[State, int]:
-        """Return the state at time t (s) after a solved step, and how many domains had folded.
+        """Return the state at time t (s) after a solved step, and the number of inverted domains.
 
         Parameters
         ----------
         state
-            At the start of the step.
+            State at the start of the step.
         on_grid, data
-            The bodies on the grid, and their pieces at the start of the step.
+            The bodies on the grid, and their integration points at the start of the step.
         loads
-            What acts at the end of the step.
-        came : (cells,), m^d
-            Fluid that came to the local cells in the step; without, what is owed to the points stays as it is.
+            Loads at the end of the step.
+        came : (n,), m^d
+            Net fluid inflow into the filled owned cells in the step; None leaves the points' volume defect unchanged.
         report
-            What the step took, which is told of where a point leaves the grid.
+            Report of the step, for the exception if a point leaves the grid.
         stays
-            Whether pieces stay in their cells where points hardly move.
+            Whether pieces may stay in their cells where points hardly move.
         carried
-            Gives velocities of points by cells (n,) that they have moved where the grid is reset, see `Mass.carried`.
+            Function of the motion (n,) of points in cells, 0 without reset, for their velocities; see `Mass.carried`.
 
         Raises
         ------
         NotConverged
-            A point is turned inside out, or its pores have closed.
+            A point is inverted, or its pores have closed.
         LeftGrid
             A point has left the grid.
         """
@@ -169,9 +169,9 @@ class Motion:
         return new, folded
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
-        """Return what gives the pressures, Pa, of fluid at rest at time t (s), but for a constant.
+        """Return a function for the hydrostatic pressures, Pa, at time t (s), up to a constant.
 
-        None where there is no gravity, or no fluid can flow.  nodal (nodes, d), m: displacement since places were cut.
+        None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None or self._storage.fluxes.flux is None:
@@ -182,7 +182,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return nodal values, a local array, where nodes are of parts all points (n,) of which stay; else zero."""
+        """Return nodal values, a local array, at nodes of parts whose points (n,) all stay; zero at other nodes."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -192,24 +192,24 @@ class Motion:
     def pressures(
         self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, of the points by those of the cells at time t (s).
+        """Return the pressures (n,), Pa, of the points from the pressures of the cells at time t (s).
 
-        nodal (nodes, d), m: displacement since the grid was reset, if there was any.
+        nodal (nodes, d), m: displacement since the reset of the grid, if any.
         """
         at_rest = self._at_rest(stage, t, nodal)
         return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
 
     def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return points with F and state as after a solved step of no time, which stay where they are."""
+        """Return points with F and state after a solved step of zero length, at unchanged positions."""
         nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
         after = points.strained(self._deformed(on_grid.cut, data, nodal))
         self._check_volumes(after, on_grid.cut)
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces.
+        """Return F (n, d, d) of the points after a step: the mean of Delta F over the pieces, with the mean of det.
 
-        Of the shape that laws see.
+        Its shape is that of the laws' F.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -229,7 +229,7 @@ class Motion:
         mean = cut.mean(cut.to_pieces(columns))
         F, J = mean[:, :-1].reshape(n, d, d), mean[:, -1]
         F = with_ratio(F, J)
-        if d > grid.stretches:  # others have no stretch across the plane
+        if d > grid.stretches:  # other points have no out-of-plane stretch
             scaled, across = in_plane(F)
             F = in_space(scaled, np.where(self._materials.stretched(cut.points), across, 1.0))
         return F
@@ -243,14 +243,14 @@ class Motion:
         bend: NDArray[np.float64],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
+        """Return the points with corners moved (n, 2^d, d), m, plus a quadratic correction `bend`, and their F.
 
-        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.
-        Soil that has yielded keeps all of that F: it does not come back, and domains in its kinks would tell too much.
+        Where Q1 cells would lock, F takes the volume ratio of the cells from `deformed`. Yielded soil takes all of F
+        from it: its deformation does not return, and domains in kinks would give wrong values.
 
         Returns
         -------
-        The points; which of them (n,) are still where they were cut; how many domains had folded.
+        The points; whether each (n,) is still at its position in the cut; number of inverted domains.
         """
         cut = on_grid.cut
         stage = state.stage
@@ -294,21 +294,22 @@ class Motion:
         came: NDArray[np.float64],
         keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
-        """Return what is owed to the points after a step (n,), over their volumes at rest, and what of it is due.
+        """Return the volume defect of the points after a step (n,), over reference volumes, and the part `due`.
 
-        That is by how much their content, by their volumes and the cells' pressures, has grown beyond the fluid that
-        came: masses, over the density at zero pressure.  Pores that drain are owed nothing: what drains from them is no
-        part of this content.  While points stay where they were cut (n,) nothing is due.
+        The defect is the growth of their content, from volumes and cell pressures, beyond the net inflow: a mass over
+        the density at zero pressure. Soil with a free surface has none: drained water is not in this content. Points
+        that stay in their cut (n,) have no correction `due`.
         """
         before = state.points
         cut = on_grid.cut
         materials = self._materials
         forms = self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
-        volume = sum_by(cut.cells, here, len(came))[cut.cells]
+        at = on_grid.contents.slot(cut.cells)
+        volume = on_grid.contents.total(cut.cells, here)[at]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
         density = np.exp((p + p_n) / (2 * forms.bulk))
-        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[cut.cells] / volume))
+        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[at] / volume))
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)
@@ -331,13 +332,13 @@ class Motion:
     def _means(
         self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the weighted means (count,) of values over each part's points, zero where there are none."""
+        """Return the weighted means (count,) of values over each part's points, zero for parts without points."""
         sums = np.stack([sum_by(part, column, count) for column in (weight * values, weight)])
         total, whole = over_all(self._momentum.grid.comm, sums)
         return np.divide(total, whole, out=np.zeros(count), where=whole > 0)
 
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
-        """Return which parts (count,) have no open side, and are fed by no source at the end of the step."""
+        """Return the parts (count,) without open sides, and without sources at the end of the step."""
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
@@ -348,24 +349,24 @@ class Motion:
         return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""
+        """Return the edges (n, d), m, of boxes with the reference volume of the points' domains."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
         size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:
-        """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
+        """Refuse states that a law may allow but a body cannot have: inverted points, pores without volume."""
         wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = np.flatnonzero(~(J > least))
         if over_all(cut.grid.comm, len(bad)):
             shown = [f"point {points.id[i]} at {points.x[i] + cut.grid.base} with J = {J[i]:.3g}" for i in bad[:1]]
-            what = "the pores have closed" if wet else "the body is turned inside out"
+            what = "the pores have closed" if wet else "the body is inverted"
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
-        """Return a state whose points take the pressures of their pieces along: the next step resets the grid."""
+        """Return a state whose points carry the pressures of their pieces: the next step resets the grid."""
         carried, points = state.pieces, state.points
         if self._storage is not None:
             with Timer("mpm: remap"):
@@ -388,7 +389,7 @@ class Motion:
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
-    """Refuse points of which a corner has left the grid, and say which."""
+    """Refuse points with a corner outside the grid, and report the worst one."""
     grid = cut.grid
     x = points.corners if cut.domains else points.x[:, None]
     message = ""
@@ -399,7 +400,7 @@ def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Rep
             f": its corner at {x[i, corner] + grid.base}" if cut.domains else ""
         )
         by = f"by {beyond[i, corner]:.3g} m at t = {t:g} s"
-        message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay in it: take a larger grid"
+        message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay inside: use a larger grid"
     if message := first(grid.comm, message):
         raise LeftGrid(message, report)
 
@@ -412,7 +413,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, where domains that have folded, whose neighbours went elsewhere, are of F."""
+    """Return corners (n, 2^d, d), m; corners of inverted domains are re-initialised from F."""
     at = np.flatnonzero(bad)
     X = points.reference[bad]
     d = grid.dim

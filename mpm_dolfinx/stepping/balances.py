@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The start of a step, and the two balances at the end of each of its substeps."""
+"""The start of a step, and the two balances at the end of each substep."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Acting(NamedTuple):
-    """What acts in a substep: its shares of the step, time, s, loads, and gravity (d,), m/s^2, if there is any."""
+    """Loads of a substep: its weights, time, s, loads, and gravity (d,), m/s^2, if any."""
 
     substep: Substep
     t: float
@@ -36,9 +36,9 @@ class Acting(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts.
+    """The start of a step of dt (s): the state on the grid, with integration points, matrices and loads.
 
-    yielded: whether soil has yielded before, on any process; renewed: how many domains were renewed.
+    yielded: whether soil has yielded before, on any process; renewed: number of renewed domains.
     """
 
     state: State
@@ -51,7 +51,7 @@ class Start(NamedTuple):
     renewed: int = 0
 
     def begun(self, acting: Acting, gone: Sequence[Any] | None) -> Acting:
-        """Return what acts in a substep as it begins; gone: what loads returned of the last one."""
+        """Return the loads at the beginning of a substep; gone: data of the loads from the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
@@ -59,15 +59,15 @@ class Start(NamedTuple):
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
-        """Return what gives velocities of points after the step, see `Mass.carried`; None without inertia."""
+        """Return a function for the velocities of points after the step, see `Mass.carried`; None without inertia."""
         if flight is None:
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return error and motion of the step, see `motion_error`, where its run asks for them; else 0.
+        """Return error and motion of the step, see `motion_error`, if the run needs them; else 0.
 
-        flights: after the substeps; substep: the last one.
+        flights: velocities after the substeps; substep: the last one.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -84,20 +84,20 @@ class Balances(NamedTuple):
     inertia: Inertia | None = None
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
-        """Return the velocities after a solved substep of a step of dt (s); None of bodies without inertia."""
+        """Return the velocities after a solved substep of a step of dt (s); None without inertia."""
         if self.inertia is None:
             return None
         acceleration = self.inertia.acceleration(self.momentum.at)
         return flight.after(acceleration, float(substep.own * dt), float(substep.before * dt))
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return what passes open sides at the end of the substep, see `StorageProblem.passing`."""
+        """Return the flow through open sides at the end of the substep, see `StorageProblem.passing`."""
         return self.storage.passing() if self.storage else []
 
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
-        """Return what conditions do to the bodies at the end of a step, see `State`.
+        """Return the outcomes of the conditions at the end of a step, see `State`.
 
-        passed, seconds: of the substeps, see `passing`, and the times, s, in which the last ones count.
+        passed, seconds: flows of the substeps, see `passing`, and the time weights, s, of the last ones.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
@@ -107,12 +107,12 @@ class Balances(NamedTuple):
         return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
-        """Return what came to the cells in the step, see `StorageProblem.came`; None without fluid."""
+        """Return the net inflow into the cells in the step, see `StorageProblem.came`; None without fluid."""
         return self.storage and self.storage.came(rates)
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return what acts in each substep, what holds bodies with its forces of an initial stress at rest."""
+    """Return the loads of each substep; supports include their forces of a balanced initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -120,7 +120,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points after a step with what they keep of the loads; refuse them where they may not be."""
+    """Return the points after a step with their data of the loads; raise if a load forbids their positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:
@@ -129,7 +129,7 @@ def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: Material
 
 
 def flight_of(start: Start) -> Flight | None:
-    """Return the velocities of the unknowns at the start of a step; None of bodies without inertia."""
+    """Return the velocities of the unknowns at the start of a step; None without inertia."""
     mass = start.matrices.mass
     if mass is None:
         return None
@@ -138,15 +138,15 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may begin where bodies go on as before: these yield, or touch without inertia."""
+    """Return whether an extrapolation of the motion may start Newton's method: with yield, or quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any(one.touches for one in loads))
 
 
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
-    """Return displacements (unknowns,), m, if bodies moved on as in the substep before, or the last step.
+    """Return displacements (unknowns,), m, extrapolated from the previous substep or step.
 
-    A local array, None where that is not known, or of no use: see `leads`.
+    They are a local array; None if they are unknown or useless: see `leads`.
     """
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
@@ -166,9 +166,9 @@ def has_yielded(scene: Scene, state: State) -> bool:
 def balances(
     scene: Scene, start: Start, acting: Acting, before: Rates | None = None, flight: Flight | None = None
 ) -> Balances:
-    """Return the balances at the end of a substep, with u and p as they are.
+    """Return the balances at the end of a substep, at the present u and p.
 
-    before: rates of the substep before; flight: velocities so far, of bodies with inertia.
+    before: rates of the previous substep; flight: present velocities, with inertia.
     """
     substep = acting.substep
     on_grid = start.on_grid
@@ -182,7 +182,7 @@ def balances(
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
-        u = inertia.flight  # elsewhere forces of inertia would hide what is out of balance
+        u = inertia.flight  # from other displacements inertia forces would hide the imbalance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)
@@ -199,6 +199,6 @@ def balances(
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
-    """Return the forces of inertia (n, d), N/m^3, on the pore fluid in the filled owned cells at u."""
+    """Return the inertia forces (n, d), N/m^3, on the pore fluid in the filled owned cells at u."""
     contents = on_grid.contents
     return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)

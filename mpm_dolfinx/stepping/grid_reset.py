@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The reset of the grid: bodies cut by its cells, the active set, and the matrices that stay while a cut serves.
+"""The reset of the grid: bodies cut by its cells, the active set, and matrices that are kept while a cut is valid.
 
 A step begins with it (`Scene.on_grid`), unless no corner has moved by more than a small part of a cell since the last
-one.  At the end of a step points only move (`advance`), and their pieces take the pressures along.
+reset. At the end of a step points only move (`advance`), and their pieces carry the pressures.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Returns values (m,) at places (m, d), m, in local cells (m,)."""
+"""Returns values (m,) at positions (m, d), m, in local cells (m,)."""
 
 
 class OnGrid(Keyed):
-    """The bodies on the grid since it was reset.
+    """The bodies on the grid since its last reset.
 
     Parameters
     ----------
     quadrature
-        Points of integration of the scene.
+        Integration points of the scene.
     momentum, storage
-        Forms, whose coefficients are set to what the cells hold; storage is None without fluid.
+        Forms; their coefficients are set to the contents of the cells. Storage is None without fluid.
     cut
-        The domains of the points, cut.
+        The cut particle domains.
     of_fluid
         Whether beta is 1/K_w, see `Scheme`.
     """
@@ -74,25 +74,30 @@ class OnGrid(Keyed):
         self.cut = cut
         self._quadrature = quadrature
         self._storage, self._u = storage, momentum.u
+        self._momentum = momentum
         self._places = quadrature.places(cut)
         self.data = quadrature.data(cut, self._places, points)
-        """The pieces when the grid was reset."""
+        """Integration points at the reset of the grid."""
         pieces = self.data.pieces
         self.weight = weight = pieces["weight"][:, 0] * grid.volumes(pieces.cells)
         """Volumes (m,) of the pieces, m^d."""
         area, x = cut.plane(weight)
-        scales = stiffness, lambda m: m.shear if m.state else 0.0  # what never yields is firm enough
+        scales = stiffness, lambda m: m.shear if m.state else 0.0  # only yielding laws need regularisation
         moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
-        self.active = momentum.ghost.fill.x.array > 0
-        """Which local cells hold something, ghosts included."""
-        self.fill = momentum.ghost.fill.x.array.copy()
-        """Filled shares of the local cells."""
-        self.cells = np.flatnonzero(self.active)
+        own, slots = self._places.pieces.filled, self._places.pieces.slots
+        contents = (sum_by(slots, rows, len(own)) for rows in (area, *moduli))
+        self.cells = momentum.set_contents(own, *contents)
+        """Local cells that contain material, ghosts included."""
+        self.active = np.zeros(grid.num_local, dtype=bool)
+        """Whether each local cell contains material."""
+        self.active[self.cells] = True
+        self.fill = np.zeros(grid.num_local)
+        """Volume fraction of the local cells."""
+        self.fill[self.cells] = momentum.ghost.fill.x.array[self.cells]
         self.facets = grid.interior_facets(self.active, self.cells)
         """Faces of this process between two active cells."""
         self.penalised = momentum.ghost.facets(self.facets)
-        """Those of nearly empty cells."""
+        """Faces with a ghost penalty."""
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
         """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
@@ -108,7 +113,7 @@ class OnGrid(Keyed):
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
-            self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
+            self.contents = CellContents(storage.fluxes, brought, own, self.cells)
             if quadrature.materials.retentions is not None:
                 lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
                 self._places = replace(self._places, lever=lever)
@@ -122,7 +127,7 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether cells hold several soils whose ratio of conductivities depends on the pressure."""
+        """Whether cells mix several soils with a pressure-dependent ratio of conductivities."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
@@ -136,7 +141,7 @@ class OnGrid(Keyed):
         return self._quadrature.masses(self.cut.points)
 
     def data_of(self, state: State) -> QuadratureData:
-        """Return the pieces with what the points, which have hardly moved since, carry now."""
+        """Return the integration points with the present data of the points, which have hardly moved."""
         if not state.stay:
             return self.data
         with Timer("mpm: integration data"):
@@ -150,7 +155,7 @@ class OnGrid(Keyed):
             p_n = self._storage.p_n.x
             p_n.array[self.contents.filled] = self.pressures(state)
             p_n.scatter_forward()
-        self._storage.p.x.array[:] = p_n.array
+        self._storage.p.x.array[self.cells] = p_n.array[self.cells]
 
     def pressures(self, state: State) -> NDArray[np.float64]:
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
@@ -158,7 +163,7 @@ class OnGrid(Keyed):
             bulk = self._storage.bulk
             retentions, new = self._quadrature.materials.retentions, self.cut.pieces
             rest = np.zeros(self.cut.grid.dim) if retentions is None else retentions.weight.value
-            old = state.pieces.potentials(bulk).less(rest)  # fluid at rest stays so: its S is not linear
+            old = state.pieces.potentials(bulk).less(rest)  # preserves hydrostatic states: S is not linear
             carried = transport(old, self.cut.points, new) + new.x @ rest
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
@@ -170,10 +175,10 @@ class OnGrid(Keyed):
         return p[self.contents.filled]
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, by which pieces bring their points' water to their cells.
+        """Return pressures (m,), Pa, of pieces with which the cells receive the water of the points.
 
-        Those of these potentials (m,), Pa, by which pressures that are linear travel unchanged, but for what keeps the
-        water of each point.
+        They are the pressures of potentials pi (m,), Pa, which preserve linear fields, corrected for each point's
+        water.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -197,39 +202,41 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what pieces have by this name in the state, fresh ones (m, ...) where they do not stay."""
+        """Return data of the pieces in the state by name, and fresh values (m, ...) for pieces that do not stay."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Give the pieces when the grid was reset; within it displacements are none, and pressures those of then."""
-        functions = [self._u] if self._storage is None else [self._u, self._storage.p, self._storage.p_n]
-        now = [f.x.array.copy() for f in functions]
-        self._u.x.array[:] = 0.0
+        """Give the integration points at the reset of the grid; within the context u is 0, and p as then."""
+        at = [(self._u.x.array, self._momentum.active.dofs)]
+        if self._storage is not None:
+            at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
+        now = [values[rows] for values, rows in at]
+        self._u.x.array[self._momentum.active.dofs] = 0.0
         if self._storage is not None:
             if state.stay:
                 self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
-            self._storage.p.x.array[:] = self._storage.p_n.x.array
+            self._storage.p.x.array[self.cells] = self._storage.p_n.x.array[self.cells]
         try:
             yield self.data
         finally:
-            for f, values in zip(functions, now, strict=True):
-                f.x.array[:] = values
+            for (values, rows), before in zip(at, now, strict=True):
+                values[rows] = before
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
+        """Return the pressures (m,), Pa, of the pieces' cells at the start of a step."""
         return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the pressures at the start of a step to those (m,), Pa, that pieces have of their cells."""
+        """Set the cell pressures at the start of a step from values (m,), Pa, at the pieces."""
         p_n = self._storage.p_n.x
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means in the filled owned cells of the potentials (m,), Pa, that pieces bring to them.
+        """Return the means in the filled owned cells of potentials (m,), Pa, of their pieces.
 
-        By what is stored, or by volume in a cell that stores nothing.
+        The weight is the storage, or the volume in a cell without storage.
         """
         contents, cells = self.contents, self.cut.cells
         potential, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
@@ -245,13 +252,13 @@ class OnGrid(Keyed):
         water: PoreWater | None = None,
         at_rest: AtPlaces | None = None,
     ) -> list[NDArray[np.float64]]:
-        """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
+        """Return pressures (m,), slopes (m, d), bounds (m, 2) at the pieces, from the cells' pressures.
 
-        The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
-        their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
+        The mean of their mass potentials in a cell is the cell's. Its weight is `store` (m,), m^d/Pa, the storage of
+        the pieces, or the volume in a cell without storage. t, s: time of the pressures on drained sides.
 
-        With `water` its sum in a cell is that at the cell's pressure, and what is reconstructed is what pressures
-        differ by from those at rest, `at_rest`, where fluid flows.
+        With `water`, its sum in a cell is preserved. The reconstruction then acts on differences from the hydrostatic
+        pressures `at_rest`, where fluid flows.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -264,10 +271,10 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        seen = self._cell_pressures(mass_potential(p_n, bulk), stage, t, bulk, at_rest)
+        seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
-        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
+        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be inclined in their cells
         pi = here[at] + share[at] * rise
         slope, bounds = (slope * share[:, None])[at], bounds[at]
         if at_rest is not None:
@@ -284,12 +291,12 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return by how much the pieces (m,) are softer than elastic ones at the start of the step."""
+        """Return the ratio (m,) of elastic to tangent shear modulus at the start of the step."""
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
     def due(self, state: State) -> NDArray[np.float64]:
-        """Return what the filled owned cells take in of what is owed to their points in a step, m^d."""
+        """Return the correction of the volume defect in the filled owned cells in a step, m^d."""
         cut, due = self.cut, state.points.volume0 * state.points.data["due"]
         share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
         return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
@@ -297,14 +304,15 @@ class OnGrid(Keyed):
     def pressures_up_to_surface(
         self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
+        """Return the pressures (m,), Pa, at the pieces' centroids; their volume mean in a cell is the cell's.
 
-        What is reconstructed is what they differ by from those at rest: at sealed sides nothing flows.
-        In axisymmetry centroids and mean are those in the plane.
+        The reconstruction acts on differences from hydrostatic pressures, because there is no flow through no-flow
+        sides. In axisymmetry centroids and mean refer to the sections.
 
-        t, s: time at which drained sides have their pressures; at_rest: pressures of the fluid at rest, where it flows.
+        t, s: time of the pressures on drained sides; at_rest: hydrostatic pressures, where fluid flows.
         """
-        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t, at_rest=at_rest)
+        places, p = self._places.pieces, self._storage.p.x.array
+        seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
         x, middle = self.cut.plane(self.weight)[1], self.cut.grid.midpoints[self.cut.cells]
         pressures = reconstruction.up_to_surface(seen, x - middle, places.slots)
         if at_rest is not None:
@@ -314,23 +322,26 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
+        """Return the data for slopes of cell pressures p (cells,), Pa, in terms of their mass potentials.
 
-        at_rest: pressures of the fluid at rest, from which these then are the differences.
+        bulk: of the fluid, Pa; at_rest: hydrostatic pressures, which are subtracted.
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
         sides = open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        cells, seen = self.cells, np.zeros(len(p))
+        seen[cells] = mass_potential(p[cells], bulk)
         if at_rest is not None:
-            x = self.cut.grid.midpoints + contents.centroid
-            p = p - at_rest(np.arange(len(x)), x)
-            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, x[sides.cells] + sides.reach))
-        outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
-        return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
+            middle, centroid = self.cut.grid.midpoints, contents.centroid
+            seen[cells] -= at_rest(cells, middle[cells] + centroid[cells])
+            beyond = middle[sides.cells] + centroid[sides.cells] + sides.reach
+            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, beyond))
+        outer = sides.ahead(contents.slot(sides.cells), seen[contents.filled])
+        return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
-        """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
+        """Return the mobility of the filled owned cells at u; begins: raise an error for invalid values."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
@@ -342,7 +353,7 @@ class OnGrid(Keyed):
     def _relative_mobility(
         self, full: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
     ) -> Mobility:
-        """Return the mobility of cells by those of their pieces with full pores (m,), m^2/(Pa s), where pores drain."""
+        """Return the mobility of cells in unsaturated soil, from saturated values at their pieces (m,), m^2/(Pa s)."""
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
@@ -358,7 +369,7 @@ class OnGrid(Keyed):
         return replace(mobility, ways=self._mixed.ways(full, law, count, mobility.shift), **given)
 
     def pore_water(self, points: MaterialPoints) -> PoreWater | None:
-        """Return what the pieces store by the porosities of the points, where pores drain; arrays by cells."""
+        """Return the water in the pieces with the porosities of the points, in unsaturated soil; arrays by cells."""
         materials, cut = self._quadrature.materials, self.cut
         if materials.retentions is None:
             return None
@@ -370,12 +381,12 @@ class OnGrid(Keyed):
 
     @property
     def heads(self) -> NDArray[np.float64]:
-        """By how much the pressures (m,) of pieces whose pores drain differ from their cells', Pa."""
+        """Pressures (m,) of unsaturated pieces less their cells' pressures, Pa."""
         return self._quadrature.materials.retentions.heads(self._places.lever)
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions about which pores of the filled owned cells drain, Pa, 1 where they stay full; None if all do."""
+        """Suction scale of drainage in the filled owned cells, Pa, 1 in saturated ones; None if all are saturated."""
         if self._quadrature.materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -384,22 +395,20 @@ class OnGrid(Keyed):
         return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
-        """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
-        at rest.
-        """
+        """Return the conductivities, m/s, of the filled owned cells in the reference configuration."""
         at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
         mean = self.contents.mean(at_pieces)
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells all points of which stay as they were cut; None where none does."""
+        """Return the filled owned cells whose points all stay in their cut; None if no point does."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return np.flatnonzero(self.contents.total(self.cut.cells, moves) == 0)
 
     def serves(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) stay where they were cut: those of parts that hardly move, of all groups at once."""
+        """Return whether each point (n,) stays in its cut: its part hardly moves; groups are tested together."""
         all_of_them = self.cut.serves(points, np.zeros(len(points), dtype=np.int64), 1)[0]
         if all_of_them or self.cut.grid.copies > 1:
             return np.full(len(points), all_of_them)
@@ -407,12 +416,17 @@ class OnGrid(Keyed):
         return self.cut.serves(points, part, count)[part]
 
     @cached_property
-    def parts(self) -> tuple[NDArray[np.int64], int]:
-        """Which of the parts that hang together, from 0, each point belongs to (n,), and how many there are.
+    def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
+        """Connected part (cells,) of each local cell, from 1, 0 for empty ones; and the number of parts."""
+        return parts_of_cells(self.cut.grid, self.active)
 
-        A part has unknowns of its own: what happens in another one it does not see.
+    @cached_property
+    def parts(self) -> tuple[NDArray[np.int64], int]:
+        """Connected part (n,) of each point, from 0, and the number of parts.
+
+        The unknowns of a part are independent of all other parts.
         """
-        part, count = parts_of_cells(self.cut.grid, self.active)
+        part, count = self.parts_of_cells
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -421,26 +435,26 @@ class OnGrid(Keyed):
     def active_cells(self) -> int:
         """Number of active cells of all processes."""
         grid = self.cut.grid
-        return int(grid.comm.allreduce(int(self.active[: grid.num_owned].sum())))
+        return int(grid.comm.allreduce(int((self.cells < grid.num_owned).sum())))
 
 
 class System:
-    """Vectors, matrices and solvers of one active set, complete when made.
+    """Vectors, matrices and solvers of one active set.
 
     Parameters
     ----------
     momentum, storage
         Compiled forms; storage is None without fluid.
     scheme
-        How they are coupled.
+        Coupling scheme.
     on_grid
         The bodies on the grid.
     dofs, nodes
         Unrolled local unknowns of the displacement, and active nodes.
     stiff
-        Whether sides have plates or given displacements.
+        Whether plates or prescribed displacements have a penalty.
     symmetric
-        Whether the momentum's tangent is.
+        Whether the momentum's tangent is symmetric.
     """
 
     def __init__(
@@ -457,28 +471,28 @@ class System:
         self._scheme = scheme
         self.symmetric = symmetric
         self.storage = None
-        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(on_grid.active)
+        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(*on_grid.parts_of_cells)
         self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
         self.plan = planned(scheme, self.momentum, self.storage, symmetric)
-        """How the linearised problem is solved."""
+        """Solution method of the linearised problem."""
 
     @cached_property
     def solvers(self) -> LinearSolvers:
-        """The solvers, made when first they are needed."""
+        """The solvers, created on first use."""
         return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
-        """Drop coarse grids that hold no tangent for other steps, before the points need the memory to move."""
+        """Drop coarse grids without a kept tangent, to free memory before the points move."""
         if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
             del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
 
 
 class Assembled(Keyed):
-    """What stays while a cut serves and a stage lasts: penalties and fluxes, in the matrices of a system.
+    """Data that are kept while a cut is valid and a stage lasts: penalties and fluxes, in the matrices of a system.
 
     Parameters
     ----------
@@ -491,7 +505,7 @@ class Assembled(Keyed):
     stage
         The conditions.
     loads
-        What acts on the bodies, placed where the points were cut.
+        Loads at the positions of the cut.
     """
 
     def __init__(
@@ -524,7 +538,7 @@ class Assembled(Keyed):
             self.mass = momentum.inertia.on(on_grid.cut, on_grid.masses, *faces, own.unknowns, own.held)
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
-        """Norm of the momentum's residual that rounding leaves, N."""
+        """Norm of the rounding error in the momentum's residual, N."""
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -539,36 +553,36 @@ class Assembled(Keyed):
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
-        """Return what rounding may leave of the residual at the local nodes (nodes,), N.
+        """Return the rounding error of the residual at the active local nodes (nodes,), N.
 
-        It goes with the stiffness of the cells about a node, and with that of what acts there.
+        It is proportional to the stiffness of the cells at a node, and to the stiffness of the loads.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
-        everywhere = np.arange(grid.num_local)
-        of_cells = ROUND_OFF * on_grid.stiffness * grid.volumes(everywhere) / grid.sizes(everywhere).min(axis=-1)
+        cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
+        of_cells[cells] = ROUND_OFF * on_grid.stiffness[cells] * grid.volumes(cells) / grid.sizes(cells).min(axis=-1)
         for one in loads:
             of_cells = one.rounding(of_cells)
-        own = np.flatnonzero(on_grid.active[: grid.num_owned])
-        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
+        own = cells[cells < grid.num_owned]
+        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # cells at a node of a flat side
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return what acts on the fluid, and what assembles the fluxes at u, called with whether a step begins.
+        """Return the fluid conditions, and a function that assembles the fluxes at u as a step begins, or later.
 
-        Where points stay in their cells, and nothing but u would change the fluxes, they are those of the start.
+        Fluxes at the start are kept where points stay in their cells, and only u could change them.
 
         Parameters
         ----------
         state
-            At the start of the step.
+            State at the start of the step.
         weight : (d,), N/m^3
-            Of the fluid, if there is gravity.
+            Unit weight of the fluid, with gravity.
         data
-            The pieces.
+            Integration points.
         t
-            Time at which open sides have their pressures and fluxes, s.
+            Time of the pressures and fluxes on open sides, s.
         dt
             The step, s.
         """
@@ -577,7 +591,7 @@ class Assembled(Keyed):
         grid = self._on_grid.cut.grid
         u = self._u
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
-        at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
+        at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may depend on time
         wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
@@ -585,7 +599,7 @@ class Assembled(Keyed):
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
-            together = [grid.comm] if mixture else []  # without pressures the key is the same on all processes
+            together = [grid.comm] if mixture else []  # without pressures the key is equal on all processes
             return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
@@ -595,20 +609,24 @@ class Assembled(Keyed):
 
         mixture = ()
         if self._by_pressure is not None:
-            mixture = (self._by_pressure.x.array.copy(),)
+            mixture = (self._by_pressure.x.array[on_grid.cells],)
             varies = (*varies, *mixture)
         if state.stays and not self._varies:
-            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
-            return feeds, lambda begins: outflow
+            of_cut = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
+            return feeds, lambda begins: of_cut
         rests = on_grid.rests(state) if not self._varies else None
 
-        def at_present(begins: bool) -> Outflow:
-            motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
-            return set_fluxes(mobility(begins), motion)
+        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
+            return set_fluxes(mobility(begins), contents.motion(nodal, rests))
 
-        # a substep begins where the one before it has ended
+        # a substep begins at the end of the previous one
         at_u = (data.pieces.key, weight, *varies)
-        return feeds, lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
+
+        def outflow(begins: bool) -> Outflow:
+            nodal = contents.nodal(u.x.array.reshape(-1, grid.dim))
+            return self._outflow((*at_u, nodal), lambda: at_present(nodal, begins), grid.comm)
+
+        return feeds, outflow
 
 
 def assembled(
@@ -621,15 +639,15 @@ def assembled(
     loads: Sequence[Loads],
     begins: bool,
 ) -> Assembled:
-    """Return the matrices of a cut and a stage; begins: refuse all parts of the bodies that are not held.
+    """Return the matrices of a cut and a stage; begins: refuse any part of the bodies that is not held.
 
     Raises
     ------
     ValueError
-        A body, or at the start of a stage a part of one, is free to move as a rigid body.
+        A body, or at the start of a stage a part of one, has a free rigid-body mode.
     """
     grid, free = on_grid.cut.grid, stage.free
-    nodes = np.flatnonzero(momentum.active_nodes(on_grid.cells))
+    nodes = momentum.active.nodes
     dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
     stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
 
@@ -640,7 +658,7 @@ def assembled(
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
-        pairs = on_grid.key if any(one.couples for one in loads) else None  # couple nodes as they lie
+        pairs = on_grid.key if any(one.couples for one in loads) else None  # contact pairs depend on the positions
         pairs = pairs, on_grid.not_full if stage.inertia else None
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
         return Assembled(momentum, storage, system, on_grid, stage, loads)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The state in which a scene begins: stresses and pore pressures as seeded, in balance with what acts on the bodies.
+"""The initial state: given stresses and pore pressures, balanced with the loads.
 
-What is out of balance, as stresses are given, or by the scheme's own error, steps of the momentum at fixed pressures
-take up: their deformation goes into the elastic strain of the points, which stay where they are, until nothing is left
-that a step would move.
+Given stresses and the scheme's error leave out-of-balance forces. Steps of the momentum at fixed pressures remove
+these. Their deformation adds to the elastic strain of the points, whose positions do not change.
 """
 
 from __future__ import annotations
@@ -38,20 +37,20 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Iterations that are mixed; the iteration ends where so many do not bring what is left down to this share.
+"""Mixed iterations; the iteration ends after PATIENCE ones that do not reduce the residual by the factor LESS.
 
 A wet bank, its law elastic or frictional, blocks on a rough base, a half held one: forces left 4e-5 to 3e-9 with 40 and
 16 and with 80 and 24, in as many iterations; with 40 and 8 up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Share of the largest given stress by which the balance changes stresses, from which on a warning says so.
+"""Change of stress in the balance, over the largest given stress, from which a warning is given.
 
-Also the share of the forces that may be left out of balance, as the scheme's error.
+Also the largest relative residual of the forces, due to the scheme's error.
 """
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
-    """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
+    """Return the pressures of pieces for a pressure field; cells have the field's values at their centroids."""
     on_grid = scene.on_grid(points)
     grid = scene.grid
     pressure = scene.initial.pressure
@@ -60,7 +59,7 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     bulk = scene.fluid.bulk
     pi = mass_potential(
         cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
-    )  # which adds up in a cell
+    )  # potentials are additive in a cell
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
     held = contents.total(cut.cells, store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
@@ -78,23 +77,23 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 
 
 def balanced(scene: Scene, state: State) -> State:
-    """Return a state whose stresses are in balance with what acts at its time, at its pore pressures.
+    """Return a state with stresses in equilibrium with the loads at its time, at its pore pressures.
 
-    A step's displacement of the grid, w, is balanced with the strains of pieces; points keep the mean of their domains.
-    So the steps are a fixed-point iteration, w <- w + u(w), here with Anderson's mixing (Walker and Ni 2011).  Where
-    means cannot balance all nodes forces hold the rest: `State.held`.  What holds sides has the force of giving way by
-    w, `State.rest`: it holds them where they are seeded, whatever a condition gives at the start.
+    A displacement w of the grid is balanced with the strains of the pieces; points keep the mean strain of their
+    domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
+    strains cannot balance all nodes: nodal forces hold the remainder, `State.held`. Supports have their force at the
+    displacement w, `State.rest`: they hold the sides at the seeded positions, whatever is prescribed at the start.
 
     Raises
     ------
     ValueError
-        There is no such balance that the laws can bear.
+        The laws admit no such equilibrium.
     """
     forms, materials = scene.momentum, scene.materials
     try:
         start = set_up(scene, state, 0.0)
         seeded = _as_reset(scene, start)
-        if scene.storage is not None:  # those that a step leaves
+        if scene.storage is not None:  # as after a step
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
         unknowns = start.matrices.momentum.unknowns
@@ -124,11 +123,11 @@ def balanced(scene: Scene, state: State) -> State:
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
-            forms.internal(start.data)  # mean dilatations are those of w
+            forms.internal(start.data)  # sets the mean dilatation at w
             points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
     except StepFailed as error:
         scene.forget()
-        raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
+        raise ValueError(f"initial_stress: must be in equilibrium with the loads at the start: {error}") from error
     left, count, points, held, rest, outcome = best
     _told(scene, seeded, points, count, left, any(one.touches for one in problem.loads))
     rest = _rest(scene, problem.loads, rest) if any(one.stiff for one in problem.loads) else None
@@ -137,18 +136,18 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log what the balance has changed; refuse one that leaves too large a share of the forces.
+    """Log the changes of the balance; refuse a large relative residual.
 
-    What bodies bear that may part (touches) is found in the first step: there a warning tells the share.
+    Contact (touches) is found in the first step only: a residual is then a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
         scene.forget()
-        what = "initial_stress: must be in balance with what acts at the start, and with what holds the bodies"
-        raise ValueError(f"{what}: {100 * left:.2g} % of the forces are left")
+        what = "initial_stress: must be in equilibrium with loads and supports at the start"
+        raise ValueError(f"{what}: {100 * left:.2g} % of the forces remain")
     before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
-    what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
+    what = "initial_stress: balanced after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces remain"
     if changed > REMARKABLE * largest or left > REMARKABLE:
         warn(comm, ConditionWarning, what, count, changed, largest, left)
     else:
@@ -156,13 +155,13 @@ def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left:
 
 
 def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a displacement of the nodes, m, zero but in the cells of sides that are held; a local array."""
+    """Return a displacement of the nodes, m, a local array; it is zero outside the cells of supported sides."""
     nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
     return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the balance of momentum at no displacement and without any rate, of points that are strained by u."""
+    """Return the balance of momentum at zero displacement and zero rates, for points strained by u."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
@@ -171,7 +170,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
 
 
 def _as_reset(scene: Scene, start: Start) -> State:
-    """Return the state at a start, of a reset since which nothing has moved."""
+    """Return the state at the start, as after a reset of the grid without motion."""
     cut, pieces = start.on_grid.cut, None
     if scene.storage is not None:
         p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
@@ -181,7 +180,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration, from those seen and their steps; local arrays, m."""
+    """Return the next displacement of a fixed-point iteration from earlier ones and their steps; local arrays, m."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Domains of soil that has flowed, renewed as the grid is reset.
+"""Renewal of the particle domains of flowing soil at a reset of the grid.
 
-Yielded soil carries F by increments, so its domains are quadrature only: they may be divided anew if the new ones fill
-the same region, keep its surface, and hold what the old ones did.  Where a domain has become longer than a cell, the
-cells that it lies in are filled anew:
+Yielded soil updates F by increments, so its domains serve for integration only. They may be replaced if the new ones
+fill the same region, keep its surface, and have the same contents. If a domain is longer than a cell, its cells are
+filled anew:
 
 * a full cell with its halves along each axis;
-* a cell that the surface passes through once with quadrilaterals about the centroid of what the body fills.  The
-  surface there becomes `EDGES` edges, between the ends and with the area of what it was, and with its sharp corners.
+* a cell that the surface crosses once with quadrilaterals about the centroid of the filled part. The surface there
+  becomes `EDGES` edges, with the same ends, area and sharp corners.
 
-What old domains have beyond these cells is cut off, and stays as it is.  Masses and volumes are exact in each cell; the
-logarithm of the elastic left Cauchy-Green tensor, and what else points carry, are means over the overlap, by mass, put
-to the new centroids by slopes fitted in each cell, within the values there: of second order.
-Cells that hold elastic soil, several bodies, sides with given displacements, or more than one pass of the surface are
-left alone.
+The parts of old domains outside these cells are cut off and kept. Masses and volumes are exact in each cell. The
+logarithm of the elastic left Cauchy-Green tensor, and other data of points, are mass means over the overlap. Fitted
+slopes shift them to the new centroids, within the range of values: they are of second order. Cells with elastic soil,
+several bodies, prescribed displacements, or several crossings of the surface are left alone.
 """
 
 from __future__ import annotations
@@ -40,16 +39,16 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.stage import Stage
 
 LONGEST = 1.0
-"""Cells that a domain may be long; the nodes bend a longer one, whose edges are straight.  Source: definition."""
+"""Largest length of a domain in cells: longer ones would bend, but their edges are straight. Source: definition."""
 
 
 class Renewal:
-    """Renews domains of a scene.
+    """Renews the particle domains of a scene.
 
     Parameters
     ----------
     grid, bodies, materials
-        Those of the scene.
+        Grid, bodies and materials of the scene.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], materials: SceneMaterials):
@@ -84,34 +83,34 @@ class Renewal:
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
 
     def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which domains (n,) are longer than `LONGEST` cells, or turned inside out in a part."""
+        """Return the domains (n,) that are longer than `LONGEST` cells, or partly inverted."""
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) have yielded, and have a law whose elastic strain is known."""
+        """Return the points (n,) that have yielded, with a law whose elastic strain is known."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, points: MaterialPoints, watched: NDArray[np.int64] | None) -> NDArray[np.bool_]:
-        """Return which points (n,) may be renewed."""
+        """Return the points (n,) that may be renewed."""
         flowed = self.flowed(points)
         return flowed if watched is None else flowed & ~np.isin(points.id, watched)
 
     def renewed(
         self, points: MaterialPoints, stage: Stage, watched: NDArray[np.int64] | None = None
     ) -> tuple[MaterialPoints, int]:
-        """Return points some of whose domains are renewed, and how many were; of all processes together.
+        """Return the points with renewed domains, and the number of replaced ones. The call is collective.
 
-        Where any should be, the first process has all points afterwards.  NotConverged, on all, where it fails.
+        After a renewal the first process has all points. A failure raises NotConverged on all processes.
 
         Parameters
         ----------
         points
             The points of this process.
         stage
-            The conditions in force.
+            The active conditions.
         watched : (m,)
             Numbers of points that may not be renewed.
         """
@@ -127,7 +126,7 @@ class Renewal:
         try:
             if comm.rank == 0:
                 made, count = self._renewed(points, stage, free)
-        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # other processes would wait
+        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised on all below
             message = str(error)
         if message := first(comm, message):
             raise NotConverged(f"renewal of domains: {message}")
@@ -147,7 +146,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of all outer faces, and numbers of what acts on each; -1 where it may not be renewed."""
+        """Return the keys of all outer faces, and a number for the conditions on each; -1 if it may not be renewed."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -165,7 +164,7 @@ class Renewal:
     def _filled(
         self, points: MaterialPoints, work: RefilledCells, new: Sequence[New], touched: Sequence[str]
     ) -> tuple[MaterialPoints, int]:
-        """Return the points with new domains in place of those that are gone."""
+        """Return the points with new domains in place of the old ones."""
         corners, group, parent, area, ends = (np.concatenate(column) for column in zip(*new, strict=True))
         old, at, share, of_group = work.pairs(corners, group)
         n, mass = len(corners), points.volume0
@@ -240,7 +239,7 @@ class Renewal:
         return stay.joined(made), len(gone_rows)
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the elastic left Cauchy-Green tensors (m, 3, 3) of some points."""
+        """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points `rows`."""
         F = np.tile(np.eye(3), (len(rows), 1, 1))
         seen = points.F_of_laws[rows]
         F[:, : seen.shape[1], : seen.shape[1]] = seen

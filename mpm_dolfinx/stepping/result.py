@@ -17,41 +17,41 @@ from mpm_dolfinx.conditions.names import ByName
 
 OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", "tool_velocity", "energy")
 OUTCOMES += ("runoff", "flowed", "ran_off", "ponded")
-"""What conditions do to the bodies; those of the user's own may have others."""
+"""Outcomes of the conditions of the package; user-defined conditions may have others."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """Histories of a run; one row an output time, the start included.
+    """Histories of a run, with one row for each output time, the start included.
 
-    Histories are arrays (n, ...) of n output times, which cannot be written into.  Where nothing was asked for they
-    have no entries along one of their axes: (n, 0, d) without probes.
+    Histories are read-only arrays (n, ...) over n output times. Quantities that were not recorded have an axis of
+    length 0: (n, 0, d) without probes.
 
     Parameters
     ----------
     rows
-        What is recorded at the output times, see `Row`.
+        Records at the output times, see `Row`.
     steps, newton, coupling, cuts, rejected
-        Numbers so far: steps, iterations, steps cut for want of convergence, and refused for their error.
+        Counts so far: steps, Newton and coupling iterations, steps cut for convergence, steps refused for their error.
     rederived
-        Domains that had folded, and were derived from F.
+        Inverted domains that were re-initialised from F.
     renewed, renewals
-        Domains of yielded soil that were replaced by new ones, and resets of the grid at which some were.
+        Renewed domains of yielded soil, and resets of the grid with renewal.
     balance, residual
-        Worst relative errors so far of the fluid's balance, and of the two problems.
+        Largest relative errors so far of the fluid balance, and of the two problems.
     wall, profile
-        Seconds, of the whole run and of each part of it on this process, from dolfinx's timers.
+        Time, s, of the whole run, and of each part of it on this process, from dolfinx's timers.
     converged
         Whether the end has been reached.
     event
-        Which function of `until` has ended the run, from 0 on, and when, s; None where none has.
+        Number of the function of `until` that ended the run, from 0, and time, s; None without an event.
     points, memory, imbalance
-        At the end of the run: material points, the peak of all processes, libraries included, MB, and the most that
-        one of several processes has over their mean.
+        At the end of the run: material points, peak memory of all processes with libraries, MB, and the largest load of
+        a process over the mean.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
-    """One an output time."""
+    """Rows of the output times."""
     steps: int = 0
     newton: int = 0
     coupling: int = 0
@@ -108,7 +108,7 @@ class Result:
 
     @cached_property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Forces (times, d), N, of each given displacement on the bodies at the output times, by its name."""
+        """Forces (times, d), N, of each prescribed displacement on the bodies, by name."""
         return self.outcome("reactions")
 
     @cached_property
@@ -118,52 +118,52 @@ class Result:
 
     @cached_property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """What leaves (times,), m^3/s, through each open side at the output times, by its name."""
+        """Outflow (times,), m^3/s, through each open side at the output times, by name."""
         return self.outcome("outflows")
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces and moments (times, d + 1), in 3D (times, 6), N and N m, of each tool and contact, by its name."""
+        """Forces and moments (times, d + 1), in 3D (times, 6), N and N m, of each tool and contact, by name."""
         return self.outcome("tool_forces")
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """How far a load has pushed (times,), m, each tool beyond its displacement at the output times, by its name."""
+        """Displacement (times,), m, of each load-controlled tool beyond its prescribed displacement, by name."""
         return self.outcome("tool_travel")
 
     @cached_property
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        kinetic and elastic are those of the bodies, and of free tools; elastic is 0 where a law tells none.  The others
-        count from the start of the run: external is the work of all that acts, viscous that against quiet sides and
-        terms of the user's, friction what slip on tools and between groups takes, internal that of the stresses;
-        dissipated is what of this is not elastic, of wet bodies also what the flow takes and water stores.  kinetic +
-        elastic + dissipated + viscous + friction - external stays as it is, but for what the method loses.
+        kinetic and elastic belong to the bodies and free tools; elastic is 0 for laws without an energy. The others
+        count from the start of the run: external is the work of all loads, viscous the work on quiet sides and
+        user-defined terms, friction that of slip on tools and between groups, internal that of the stresses; dissipated
+        is the part of internal that is not elastic, in wet bodies with the work of flow and storage of water. kinetic +
+        elastic + dissipated + viscous + friction - external is constant, up to losses of the method.
         """
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return what conditions have done (n, ...) at the output times, by name, such as "reactions".
+        """Return an outcome (n, ...) of the conditions at the output times, by name, such as "reactions".
 
-        nan where a condition was not there.
+        nan at times without the condition.
         """
         rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
         return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
 
     def to_dataframe(self):
-        """Return the histories as a data frame of pandas, one row an output time, with the columns of `history.csv`.
+        """Return the histories as a pandas data frame, one row for each output time, with the columns of `history.csv`.
 
-        Its `attrs["units"]` has the unit of each column.  ImportError where pandas is not installed.
+        Its `attrs["units"]` has the unit of each column. ImportError if pandas is not installed.
         """
         return data_frame(self, {name: self.outcome(name) for name in OUTCOMES})
 
     def to_xarray(self):
-        """Return the histories as a data set of xarray, with units as attributes of its variables.
+        """Return the histories as an xarray data set, with units as attributes of its variables.
 
-        Dimensions are time, probe and axis, of stresses of probes row and column; conditions have variables by their
-        names.  Its attributes are the counts of the run.  ImportError where xarray is not installed.
+        Dimensions are time, probe and axis, for stresses at probes row and column; variables of conditions have their
+        names. Its attributes are the counts of the run. ImportError if xarray is not installed.
         """
         counts = {name: getattr(self, name) for name in ("steps", "newton", "cuts", "balance", "residual", "wall")}
         return data_set(self, {name: self.outcome(name) for name in OUTCOMES}, counts)
@@ -187,10 +187,10 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return seconds and share of the wall time of each part, memory and imbalance as a table."""
+        """Return time, s, and fraction of the wall time of each part, memory and imbalance as a table."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
-        if self.points:  # measured when a run has ended
+        if self.points:  # measured at the end of a run
             each = 1024 * self.memory / self.points
             lines.append(f"{'memory':18} {self.memory:8.0f} MB, {each:.3g} kB for each of {self.points} points")
         if self.imbalance:
@@ -200,16 +200,16 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """A run could not go on: a step that fails however short.
+    """The end of a run by a step that fails, however short.
 
-    The simulation is in the state of the last good step, from which other conditions or another step may go on.
+    The simulation is in the state of the last good step. Other conditions or other steps may continue from there.
 
     Attributes
     ----------
     result
         Histories up to the last good output time.
     history
-        Relative residuals (momentum, storage) of the failed step's iterations, if it came to any.
+        Relative residuals (momentum, storage) of the failed step's iterations, if any.
     """
 
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):

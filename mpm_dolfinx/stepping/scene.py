@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A scene as it is compiled: grid, bodies, materials and forms; all that lasts from its first step to its last."""
+"""A compiled scene: grid, bodies, materials and forms, which last from the first step to the last."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ from mpm_dolfinx.stepping.state import State
 
 
 class When(NamedTuple):
-    """A substep: its end, s, with the time since the start of the step, s, and gravity (d,), m/s^2, or None.
+    """A substep: its end, s, time since the start of the step, s, and gravity (d,), m/s^2, or None.
 
-    own: time in which a rate at its end counts, s; past: share of the displacements at its start before it.
+    own: time weight of the rate at its end, s; past: fraction of the displacement at its start, see `Velocity`.
     """
 
     t: float
@@ -59,7 +59,7 @@ class When(NamedTuple):
 
 
 class Scene:
-    """A scene.  Nothing of it tells one step from another: what a step depends on is in its `State`.
+    """A compiled scene. It is the same in all steps: the data that differ between steps are in the `State`.
 
     Parameters
     ----------
@@ -68,13 +68,13 @@ class Scene:
     weighs
         Whether there is gravity.
     pressure
-        Pore pressure at the start, Pa, or a function of places.
+        Initial pore pressure, Pa, or a function of position.
     extensions
-        The user's terms in the balance of momentum, and those in the storage of fluid.
+        User-defined terms in the balance of momentum, and in the storage of fluid.
     initial
         Stresses of bodies as seeded, see `initial_stress.by_body`.
     velocity
-        At the start, m/s, of a scene whose bodies may have inertia, see `Simulation`; None of others.
+        Initial velocity, m/s, of a scene whose bodies may have inertia, see `Simulation`; else None.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Scene:
         self.fluid = fluid
         self.numerics, scheme = numerics, numerics.scheme
         terms, sources = self.extensions = extensions
-        """The user's terms and sources."""
+        """User-defined terms and sources."""
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
@@ -129,20 +129,32 @@ class Scene:
             law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
             kind = (symmetric, scene.conducts, scene.evolves)
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
-            forms = (pieces, u, p, fluid.bulk, weight, *kind, law, feeding, inertial, scene.retentions)
+            forms = (
+                pieces,
+                u,
+                p,
+                self.momentum.active,
+                fluid.bulk,
+                weight,
+                *kind,
+                law,
+                feeding,
+                inertial,
+                scene.retentions,
+            )
             self.storage = StorageForms(*forms)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
-        # what is still to be looked for, to be warned of, of which nothing but the log knows
+        # pending checks for warnings, which affect the log only
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
         self._renewed: Latest[tuple[MaterialPoints, int]] = Latest()
-        _ = self._renewal  # refuses scenes that have none
+        _ = self._renewal  # refuses scenes without support for it
 
     @property
     def flows(self) -> bool:
-        """Whether fluid moves, or is brought by sources."""
+        """Whether fluid flows, or sources add it."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
 
     @property
@@ -161,7 +173,7 @@ class Scene:
         u: NDArray[np.float64] | float | None = None,
         **options,
     ) -> MomentumProblem:
-        """Return the balance of momentum at the end of a substep, which begins: all that forms see of it is set.
+        """Return the balance of momentum at the end of a substep; all coefficients of its forms are set.
 
         Parameters
         ----------
@@ -175,20 +187,21 @@ class Scene:
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
             self.gravity.value = when.gravity
-        self.momentum.velocity.set(when.own, when.past)
+        self.momentum.velocity.set(when.own, when.past, self.momentum.active.dofs)
         if self.storage is not None:
-            self.storage.p_before.x.array[:] = self.storage.p.x.array
+            cells = self.momentum.active.cells
+            self.storage.p_before.x.array[cells] = self.storage.p.x.array[cells]
         if u is not None:
             self.momentum.u.x.array[:] = u
         return MomentumProblem(self.momentum, system, data, loads, self.scheme.tolerance, **options)
 
     @cached_property
     def _told(self) -> set[str]:
-        """What has been warned of, of which nothing but the log knows."""
+        """Subjects of past warnings, which affect the log only."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Warn, once, of a gravity at the start of a step and in it that is not that of the conductivities."""
+        """Warn, once, if the gravity of a step differs from that of the conductivities."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._told:
             return
         if strength := other_gravity(self.fluid, gravity):
@@ -198,16 +211,16 @@ class Scene:
             self._told.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
-        """Set the weight of the fluid by which pressures within a cell differ where pores drain, see `Retentions`.
+        """Set the fluid's weight for the pressure variation within cells of unsaturated soil, see `Retentions`.
 
-        Of a stage at the time, s, at which a step begins; where gravity changes the grid is reset in each step.
+        It belongs to a stage at the time, s, at the start of a step; a varying gravity resets the grid in each step.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def check(self, state: State) -> None:
-        """Refuse what is no state of this scene: its conditions act on the materials of another one."""
+        """Refuse an object that is not a state of this scene: its conditions act on the materials of another one."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
@@ -216,7 +229,7 @@ class Scene:
         grid = self.grid
 
         def make() -> OnGrid:
-            self._assembled.clear()  # of coefficients that change now
+            self._assembled.clear()  # its coefficients change now
             with Timer("mpm: cut domains"):
                 cut = CutDomains(grid, points, self.numerics.quadrature == "domain", self.momentum.inertia is not None)
                 self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
@@ -228,7 +241,7 @@ class Scene:
 
     @cached_property
     def _renewal(self) -> Renewal | None:
-        """Renews domains; None where these are never renewed."""
+        """Renews particle domains; None without renewal."""
         grid = self.grid
         if not self.numerics.renewal:
             return None
@@ -248,9 +261,9 @@ class Scene:
         return Renewal(grid, self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
-        """Return a state for a reset of the grid, with points at their owners, and how many domains were renewed.
+        """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
 
-        renew: whether any may be.
+        renew: whether renewal is allowed.
         """
         if self._renewal is None or state.stay is not None or not renew:
             return state.at_owners(self.grid), 0
@@ -270,9 +283,9 @@ class Scene:
         Parameters
         ----------
         now
-            What acts on the bodies.
+            Present loads.
         as_cut
-            Returns this, placed where the points were cut.
+            Returns the loads at the positions of the cut.
         begins
             Whether all parts of the bodies must be held.
         """
@@ -284,12 +297,12 @@ class Scene:
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
     def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
-        """Return the numbers of all points of the bodies that are there."""
+        """Return the numbers of all points of the bodies that are present."""
         return np.flatnonzero(np.repeat(present, [len(body) for body in self.bodies]))
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """The constants that make the scene, by name: what a checkpoint of it is known by."""
+        """The constants that define the scene, by name: a checkpoint is identified by them."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         if not grid.even:
@@ -309,7 +322,7 @@ class Scene:
         for name, one in {**materials, "fluid": self.fluid}.items():
             out[name] = None if one is None else type(one).__name__
             constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-            laws = ("retention",)  # known by what it gives, in the checksums
+            laws = ("retention",)  # identified by its values, in the checksums
             given = {key: value for key, value in constants.items() if key not in laws and value is not None}
             constants = {key: value for key, value in given.items() if not callable(value)}
             out |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
@@ -317,10 +330,10 @@ class Scene:
 
     @property
     def last(self) -> tuple[OnGrid | None, Assembled | System | None]:
-        """The bodies as they were last cut, and the matrices of the last step, to be looked at."""
+        """The bodies as last cut, and the matrices of the last step, for inspection."""
         return self._on_grid.value, self._assembled.value or self._systems.value
 
     def forget(self) -> None:
-        """Drop all that was made for a step: it may have been broken off anywhere."""
+        """Drop all data of a step: it may have been interrupted anywhere."""
         for made in (self._assembled, self._systems, self._on_grid):
             made.clear()

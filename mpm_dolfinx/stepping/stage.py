@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A stage: which bodies are there and what acts on them."""
+"""A stage: the bodies that are present, and the conditions on them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from mpm_dolfinx.mechanics.plates import Plates
 from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
 Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Rain | Tool | Contact
-"""What acts on the bodies."""
+"""Conditions on the bodies."""
 KINDS: tuple[type[Acting], ...] = (
     Tractions,
     Pressures,
@@ -57,13 +57,13 @@ KINDS: tuple[type[Acting], ...] = (
     ToolsOfStage,
     ContactsOfStage,
 )
-"""What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
+"""Loads on the momentum, for conditions without a method `acting`."""
 FED: tuple[type[Feeding], ...] = (DrainedSides,)
-"""What acts on the storage of fluid for conditions that do not say it themselves, by their method `feeding`."""
+"""Fluid conditions, for conditions without a method `feeding`."""
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
-    """Return conditions; ValueError where one is none."""
+    """Return the conditions; ValueError for an object that is not a condition."""
     if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
         raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
     if isinstance(conditions, Sequence) and not isinstance(conditions, (str, bytes)):
@@ -79,12 +79,12 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The conditions in force.
+    """The active conditions.
 
-    given: the conditions by their names, as they were given; named: the same, with water as heavy as the pore fluid;
-    conditions: walls, the axis among them, and gravity; present: which bodies are there; later: those that may still
-    come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of the bodies that are
-    there; materials: of the scene; acting: what the conditions do to the momentum; feeding: to the storage of fluid.
+    given: conditions by name, as they were given; named: the same, with the unit weight of water from the pore fluid;
+    conditions: walls, including the axis, and gravity; present: whether each body is present; later: bodies that may
+    still be added; free: (nodes, d), components that no wall fixes; axisymmetric: as the grid; lattices: of the bodies
+    that are present; materials: of the scene; acting: loads on the momentum; feeding: conditions on the fluid.
     """
 
     given: Mapping[str, Condition]
@@ -106,53 +106,53 @@ class Stage:
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces of all conditions but tools and contacts."""
+        """The faces of all conditions except tools and contacts."""
         return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
 
     @property
     def faces(self) -> list[Surface]:
-        """The faces of all conditions, on which tools press among them."""
+        """The faces of all conditions, including the faces that tools may touch."""
         return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of some classes by their names."""
+        """Return the conditions of some classes by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     @property
     def symmetric(self) -> bool:
-        """Whether the tangent of what acts is symmetric."""
+        """Whether the tangent of all loads is symmetric."""
         return all(one.symmetric for one in self.acting)
 
     @property
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
-        """Conditions that hold faces, these, and along which axes."""
+        """Conditions that support faces, with these faces and the axes."""
         return [one for acting in self.acting for one in acting.held]
 
     def placed(self, place: Place) -> list[Loads]:
-        """Return what acts on the momentum in a substep."""
+        """Return the loads on the momentum in a substep."""
         with Timer("mpm: loads"):
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Refuse a stage that begins in a place where it cannot."""
+        """Refuse a stage that cannot begin at this place."""
         for one in self.acting:
             one.check_start(place)
 
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
-        """Return what n points keep of the conditions, as these begin."""
+        """Return the initial data of the conditions at n points."""
         return {data: rows for one in self.acting for of in one.kept(n).values() for data, rows in of.items()}
 
     def data_names(self, names: Collection[str]) -> set[str]:
-        """Return under which names points keep data of conditions of some names."""
+        """Return the names of point data of the conditions with these names."""
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return the names of conditions that there were in the stage before, or that had the name given to them."""
+        """Return the names of conditions that are unchanged from the previous stage, or have their own name."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return an outcome of this value, where no step has been taken."""
+        """Return outcomes of this value, before the first step."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -167,7 +167,7 @@ class Stage:
         return out
 
     def begun(self, before: Stage, outcome: Outcome, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outcome as the stage begins after another: of this value for what is new in it."""
+        """Return the outcome at the beginning of the stage after another one; new conditions have this value."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
@@ -177,7 +177,7 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy, J, of free tools by an outcome."""
+        """Return the kinetic energy, J, of free tools from an outcome."""
         velocity = outcome.get("tool_velocity", {})
         return sum(self.named[name].mass / 2 * float(v @ v) for name, v in velocity.items() if name in self.named)
 
@@ -209,20 +209,20 @@ def stage(
     grid, bodies
         Background grid, and all bodies of the scene.
     materials
-        Those of the scene.
+        Materials of the scene.
     fluid
         Pore fluid, if there is one.
     momentum, fed
-        Forms, and what acts on the momentum in all stages; what feeds the fluid in all of them.
+        Forms with the loads of all stages; fluid conditions of all stages.
     conditions
         walls, conditions, gravity: see `Simulation`.
     present, later
-        Which bodies are there, and which may still come.
+        Whether each body is present, and bodies that may still be added.
 
     Raises
     ------
     ValueError
-        Naming the condition, its value and what is allowed.
+        An invalid condition; the message has its name, its value and the allowed values.
     """
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
@@ -236,7 +236,7 @@ def stage(
     elif gravity is not None:
         gravity = _gravity(gravity, "gravity", grid.dim, grid.axisymmetric).copy()
     if not any(present):
-        raise ValueError("bodies: none is there, must be at least one")
+        raise ValueError("bodies: none is present, must be at least one")
     walls = with_axis(grid, conditions["walls"])
     free = ~_held(grid, walls)
     sides = Sides(grid, bodies, present)
@@ -254,7 +254,7 @@ def stage(
             "walls": dict(walls),
             "gravity": gravity,
             "inertia": bool(conditions["inertia"]),
-        },  # nobody changes what a stage was given
+        },  # copies: a stage is immutable
         present=tuple(present),
         later=tuple(later),
         free=free,
@@ -267,7 +267,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Refuse conditions that bodies with inertia do not have yet, and those that only they have."""
+    """Refuse conditions that do not support inertia, and conditions that need it."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
@@ -276,7 +276,7 @@ def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
         if not inertia:
             continue
         if isinstance(one, Tool) and one.load is not None and not one.free:
-            raise ValueError(f"{name}: the tool has a load, and no mass, must have one with inertia")
+            raise ValueError(f"{name}: the tool has a load but no mass, must have a mass with inertia")
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:
@@ -287,7 +287,7 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
 
 
 def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
-    """Return which components (nodes, d) are held by walls."""
+    """Return the components (nodes, d) that walls fix."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
     if not isinstance(walls, Mapping):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From one stage to the next: bodies come and go, conditions change, fields of the points are set anew."""
+"""Transitions between stages: bodies are added and removed, conditions change, and point data are replaced."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from mpm_dolfinx.stepping.step import set_up
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
+    """Return the state of a scene at rest, in its first stage, with given stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, conditions, present, later)
     if scene.initial.given and (quiet := begun.of(Quiet)):
         raise ValueError(
-            f"{next(iter(quiet))}: holds no initial stress, must come in a stage after one that holds the side"
+            f"{next(iter(quiet))}: cannot hold an initial stress, must begin a stage later: first prescribe the side"
         )
     _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
     if scene.fluid and scene.materials.conducts:
@@ -76,16 +76,16 @@ def begin_stage(
     reset_displacement: bool,
     fields: Mapping[str, ArrayLike],
 ) -> State:
-    """Return the state in which a stage begins: see `Simulation.stage`; named: the conditions that are new."""
+    """Return the state at the beginning of a stage: see `Simulation.stage`; named: the new conditions."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
-        raise ValueError("gravity: the scene was made without, must be made with (0, 0) first")
+        raise ValueError("gravity: the scene has none, must be created with gravity=(0, 0)")
     if "inertia" in named:
         flag("stage: inertia", named["inertia"])
         if scene.momentum.inertia is None:
-            raise ValueError("stage: inertia: the scene was made without, must be made with inertia=False first")
+            raise ValueError("stage: inertia: the scene has none, must be created with inertia=False")
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
-    chosen("stage: add", add, list(before.later), "bodies that are to come later")
+    chosen("stage: add", add, list(before.later), "bodies that are still to be added")
     flag("stage: reset_displacement", reset_displacement)
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
@@ -100,7 +100,7 @@ def begin_stage(
         raise ValueError(f"{next(iter(new_quiet))}: bodies had inertia before, must be quiet from its first stage on")
     state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
-    if state.stays:  # pressures are those of the cells
+    if state.stays:  # points have the pressures of their cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
     own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
@@ -137,11 +137,9 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, begun: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return a state at rest, and by names of data the tractions (m, d), Pa, that points (m,) bear on quiet sides.
+    """Return a state at rest, and tractions (m, d), Pa, on points (m,) of new quiet sides, by names of data.
 
-    They balance the stresses, and the loads of the stage that ends, with what goes on holding the bodies.
-
-    begun: the stage that makes sides quiet.
+    They balance stresses, loads of the previous stage, and remaining supports. begun: the stage with the quiet sides.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -152,7 +150,7 @@ def _released(
     cut = start.on_grid.cut
 
     def beside(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return which components (nodes, d) along some axes belong to nodes of cells with some faces."""
+        """Return the components (nodes, d) along `axes` of nodes in cells with the faces `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
@@ -175,7 +173,7 @@ def _released(
 def _gripped(
     scene: Scene, begun: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return points with what they keep of conditions: nothing, or what the same points had `before`."""
+    """Return points with their data of conditions: initial values, or values of the same points `before`."""
     kept = begun.kept(len(points))
     if taken := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{taken[0]!r}: points have data of this name, must be another name of a condition")
@@ -183,7 +181,7 @@ def _gripped(
 
 
 def _holds_as(begun: Stage, before: Stage) -> bool:
-    """Return whether the same conditions hold the same faces."""
+    """Return whether the same conditions support the same faces."""
     return len(begun.held) == len(before.held) and all(
         hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
         for (hold, faces, _), (was, then, _) in zip(begun.held, before.held, strict=True)
@@ -191,7 +189,7 @@ def _holds_as(begun: Stage, before: Stage) -> bool:
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return conditions with the scene's contacts, which no stage changes."""
+    """Return conditions with the scene's contacts, which stages cannot change."""
     there, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and given != there:
         raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
@@ -204,9 +202,9 @@ def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool],
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
-    """Warn for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
+    """Warn of each water level, given or on a side, whose unit weight differs from the pore fluid's.
 
-    In a dry scene for each that is as heavy as water is under another gravity.
+    In a dry scene warn of each level with the unit weight of water under another gravity.
     """
     gravity, fluid = begun.conditions["gravity"], scene.fluid
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
@@ -224,7 +222,7 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
-    """Warn for each condition that stays as it was and acts on what an excavation has laid bare."""
+    """Warn of each unchanged condition that also acts on faces exposed by an excavation."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in begun.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -236,7 +234,7 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
         new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
-            what = "stage: remove: %s stays as it was and now also acts on %.3g m^%d that were laid bare, from %s on"
+            what = "stage: remove: %s is unchanged and now also acts on %.3g m^%d of newly exposed faces, first at %s"
             values = line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0)
             warn(scene.grid.comm, ConditionWarning, what, *values)
 
@@ -244,7 +242,7 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
+    """Return the points with the points of added bodies, and the latter alone; a body is placed after its base."""
     there = list(there)
     waiting = list(add)
     new = scene.materials.seeded.of(_ids(scene.bodies, []))
@@ -266,16 +264,16 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return points without the data that only a stage gave them, which bodies that come have not."""
+    """Return points without data from earlier stages, which added bodies do not have."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
-        raise ValueError(f"{what}, must be given anew for all in fields=")
+        raise ValueError(f"{what}, must be given for all points in fields=")
     return replace(points, data={name: rows for name, rows in points.data.items() if name not in extra})
 
 
 def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
-    """Return the numbers of the points of some bodies."""
+    """Return the numbers of the points of the chosen bodies."""
     stop = np.cumsum([len(body) for body in bodies])
     return np.concatenate([np.empty(0, np.int64), *(np.arange(stop[i] - len(bodies[i]), stop[i]) for i in chosen)])
 
@@ -287,7 +285,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
     for name, value in fields.items():
         if name not in data and name in scene.materials.constants:
             law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
-            allowed = f"given to it as a function of place, lambda X: np.full(len(X), {value}), to be changed"
+            allowed = f"given to it as a function of position, lambda X: np.full(len(X), {value}), to be changed"
             raise ValueError(f"stage: fields: {name!r}: a constant of {law}, must be {allowed}")
         new, what = numbers(f"stage: fields: {name}", value, None, allowed="finite numbers"), f"stage: fields: {name!r}"
         if name in data and new.shape == data[name].shape[1:]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The state of a scene: all that it remembers between two steps."""
+"""The state of a scene: its complete memory between two steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpm_dolfinx.stepping.step_control import StepControl
 
 
 def _freeze(kept: Mapping[str, Any]) -> None:
-    """Let nobody write into the arrays of what is kept."""
+    """Make all arrays read-only."""
     for values in kept.values():
         if isinstance(values, np.ndarray):
             values.flags.writeable = False
@@ -33,12 +33,12 @@ def _freeze(kept: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stay:
-    """What still holds of the last reset of the grid: points that hardly move since stay in the cells that cut them.
+    """The kept cut: points that have hardly moved since the last reset of the grid stay in the cells that cut them.
 
     points
-        The material points when the grid was reset.
+        The material points at the reset of the grid.
     keeps : (n,)
-        Points for which it still holds: those of parts of the bodies that hardly move.  None: for all.
+        Points for which the cut is valid, in parts of the bodies that hardly move. None: all points.
     """
 
     points: MaterialPoints
@@ -48,7 +48,7 @@ class Stay:
         _freeze(vars(self))
 
     def migrated(self, exchange: Exchange) -> Stay:
-        """Return what holds for points that go to their destinations, by the exchange of points."""
+        """Return the kept cut after an exchange of points."""
         keeps = self.keeps
         if keeps is not None:
             keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
@@ -57,44 +57,44 @@ class Stay:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
-    """All that a scene remembers between two steps.  A step makes a new one; nobody changes one.
+    """The complete memory of a scene between two steps; immutable. A step makes a new one.
 
-    A checkpoint holds all of it but the stage, which the script gives.
+    A checkpoint holds all of it but the stage, which the script defines.
 
     t
         Time, s.
     points
-        The material points of this process.  Their places count from the grid's `base`, unlike those of
-        `Simulation.points`, which a state refuses: `PlacedPoints.from_base` gives them back.
+        The material points of this process, with positions relative to the grid's `base`. A state does not accept
+        `Simulation.points`, which have true positions: `PlacedPoints.from_base` converts them.
     pieces
-        Pressures that the pieces of the points' domains have, and take to the next grid; None without fluid.
+        Pressures of the pieces of the particle domains, for the transfer to the next grid; None without fluid.
     stay
-        What holds of the last reset of the grid; None where the next step resets all of it.
+        The kept cut; None if the next step resets the whole grid.
     resets
-        How often the grid has been reset.
+        Number of resets of the grid.
     outcome
-        What conditions do to the bodies, by quantity and name, at the end of the last step; nan before the first one of
-        a stage that has others.  reactions (d,), N, of given displacements; wall_reactions (d,), N, of the grid's
-        walls; outflows, m^3/s (m^2/s in plane strain), volumes at zero pressure that leave through open sides;
-        tool_forces (d + 1,), in 3D (6,), N and N m, forces and moments of tools and contacts on the bodies;
-        tool_travel, m, how far loads have pushed tools beyond their displacement; and what the user's own give.
+        Outcomes of the conditions at the end of the last step, by quantity and name; nan for new conditions before the
+        first step of a stage. reactions (d,), N, of prescribed displacements; wall_reactions (d,), N, of the grid's
+        walls; outflows, m^3/s (m^2/s in plane strain), volumes at zero pressure through open sides; tool_forces (d +
+        1,), in 3D (6,), N and N m, forces and moments of tools and contacts on the bodies; tool_travel, m,
+        displacements of load-controlled tools beyond the prescribed ones; and outcomes of user-defined conditions.
     stage
-        The conditions in force.
+        The active conditions.
     begins
-        Whether no step of the stage has been taken.
+        Whether the stage has had no step yet.
     velocity : (unknowns,), m/s
-        Of the nodes of this process in the last step, ghosts included: where Newton's method may begin where bodies
-        yield or touch.  None before the first step, and elsewhere.
+        Nodal velocities of this process in the last step, ghosts included: an initial guess for Newton's method with
+        yield or contact. None before the first step, and without either.
     held : (unknowns,), N
-        Forces on the nodes of this process, ghosts included, that hold what the scheme's error leaves out of balance of
-        an initial stress; None without, once a stage begins, and once bodies have moved so far that the grid is reset.
+        Nodal forces of this process, ghosts included, for the imbalance of an initial stress due to the scheme's error.
+        None without, after a new stage, and after a reset of the grid.
     rest : (unknowns,), m
-        Displacement of the nodes of this process, ghosts included, for which given displacements and plates have the
-        forces of an initial stress at rest; None once a stage changes these, and once the grid is reset.
+        Nodal displacement of this process, ghosts included, at which prescribed displacements and plates have their
+        forces of an initial stress. None after a stage that changes them, and after a reset of the grid.
     watched : (m,)
-        Numbers of the points whose domains probes are in, which are not renewed.
+        Numbers of points with probes in their domains, which are not renewed.
     result, control
-        Histories of the last run, and the memory of its step sizes; None before the first one.
+        Histories of the last run, and its step control; None before the first run.
     """
 
     t: float
@@ -114,7 +114,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points are at true places, must count from the grid's base: use points.from_base")
+            raise ValueError("state: points are at true positions, must count from the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property
@@ -124,16 +124,16 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """The points where the next step has them cut: those that hardly move stay as they were."""
+        """The points at the positions where the next step cuts them: as before for points that stay."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return what pieces have: values of this name where they stay, else fresh ones (m, ...).
+        """Return data of the pieces by name where they stay, and fresh values (m, ...) elsewhere.
 
         point : (m,)
-            Which of the points each piece belongs to; those that are kept have the pieces that they had.
+            Point of each piece; points that stay keep their pieces.
         """
         if self.stay is None:
             return fresh
@@ -145,7 +145,7 @@ class State:
         return out
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
-        """Return the state after every point, with its pieces, went to its destination (n,), a rank."""
+        """Return the state after every point, with its pieces, has moved to its destination (n,), a rank."""
         exchange = Exchange(comm, destination)
         pieces = self.pieces
         if pieces is not None:
@@ -154,7 +154,7 @@ class State:
         return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay)
 
     def at_owners(self, grid: Grid) -> State:
-        """Return the state with points and pieces at the processes that own the points' cells."""
+        """Return the state with points and pieces at the processes that own their cells."""
         if grid.comm.size == 1:
             return self
         placed = self.as_cut

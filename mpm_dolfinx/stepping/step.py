@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One step of a scene: the algorithm, and the only place that knows its order."""
+"""One step of a scene: the algorithm, in its only place."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
-    """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in its substeps."""
+    """Return the start of a step of dt (s): the state on the grid, matrices, and the loads of the substeps."""
     scene.check(state)
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
@@ -30,7 +30,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     state, renewed = (state, 0) if state.stays else scene.for_reset(state, dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
-    on_grid.cut.surfaces(stage.surfaces)  # all at once
+    on_grid.cut.surfaces(stage.surfaces)  # cut together
     data = on_grid.data_of(state)
     place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome, stage.inertia)
     if state.begins:
@@ -39,14 +39,14 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
     matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
-    scene.momentum.u.x.array[:] = 0.0
+    scene.momentum.u.x.array[scene.momentum.active.dofs] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
     return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed)
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
-    """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
+    """Return the state after a step of dt (s), and its report; `state` is unchanged, even after an error."""
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the rule for the length of steps remembers between two of them."""
+"""The memory of the step-size rule between two steps."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ class StepControl:
     interval : s
         Output interval of the run, 0 without one.
     small : s
-        The step to try next.
+        Next trial step.
     waits, kept
         See `StepSize.grown`.
     change : Pa
-        Largest change of the pressures since the run began.
+        Largest pressure change since the start of the run.
     first : Pa/s
-        See `Report`: of the last step, over its length where the grid is reset.
+        See `Report`: value of the last step over its length, if the grid is reset.
     motion : J^(1/2)
-        Largest motion since the run began, see `motion_error`; None where it is not asked for.
+        Largest motion since the start of the run, see `motion_error`; None if it is not needed.
     filled
-        Largest change of the water content in a step since the run began.
+        Largest change of the water content in a step since the start of the run.
     """
 
     interval: float = 0.0

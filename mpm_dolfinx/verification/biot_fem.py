@@ -4,14 +4,18 @@
 With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
 on the reference configuration of a box, from state n:
 
-    momentum   int d/dF [psi(F) - alpha p J] : grad v dV  =  int t . v dA    (tractions t: dead, or pressures)
-    storage    int rho [zeta(J, p) - zeta_n] q dV  +  int int kappa J F^-1 F^-T grad pi . grad q dV dt  =  0
+    momentum   int [d psi/dF - alpha chi p dJ/dF] : grad v dV  =  int t . v dA + int m g . v dV
+    storage    int rho [zeta(J, p) - zeta_n] q dV
+               + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
+with tractions t, dead or pressures, and the mass m of soil and fluid.
 kappa = k/(rho_w g), the content zeta and the mass potential pi those of `fluid_content`, rho = exp((p + p_n)/(2 K_w)),
-the integral over the step that of `time_integration`.
+the integral over the step that of `time_integration`.  Under suction kappa is k_r times it, and the change of the
+content S(p) of that at full pores, and that of S, see `retention`; full pores have chi = S = k_r = 1.
 With pressures constant in the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of
-the cells' centres; it is not consistent where the body shears.  In axisymmetry F has the hoops' stretch and integrals
-are those of the whole revolution.  Materials, the user's terms and sources, and time
+the cells' centres; it is not consistent where the body shears.  k_r is then its mean over the pressures between the
+two cells.  In axisymmetry F has the hoops' stretch and integrals
+are those of the whole revolution.  Materials, retention, the user's terms and sources, and time
 integration are those of the material point method, so the two differ in discretisation only.
 """
 
@@ -36,7 +40,12 @@ from tqdm import tqdm
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged, Report
-from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
+from mpm_dolfinx.base.fluid_content import (
+    change_of_content,
+    density_between,
+    mass_potential,
+    mass_potential_form,
+)
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
@@ -53,6 +62,7 @@ from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.probing.probes import positions
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
+from mpm_dolfinx.verification.pores import Pores
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
@@ -62,17 +72,19 @@ class Space:
     """The space W of the unknowns w = (u, p/scale), or of w = u, and functions in it.
 
     old: w at the start of the step; past: its change that the rate of a substep begins with; b, f: residual and loads;
-    u, p: displacement and pressure; p_dofs: where the pressures are.
+    same: equal to w, without a slope; u, p: displacement and pressure; p_dofs: where the pressures are; of_p: their
+    space alone.
     """
 
     def __init__(self, grid: Grid, wet: bool, degree: int, pressure: tuple[str, int, tuple[int, ...]]):
         self.degree, vector = degree, ("Lagrange", degree, (grid.dim,))
         if wet:
             self.W = _compat.mixed_space(grid.mesh, [vector, pressure])
-            self.p_dofs = np.asarray(self.W.sub(1).collapse()[1])
+            self.of_p, dofs = self.W.sub(1).collapse()
+            self.p_dofs = np.asarray(dofs)
         else:
             self.W, self.p_dofs = _compat.function_space(grid.mesh, *vector), slice(0)
-        self.w, self.old, self.past, self.b, self.f = (fem.Function(self.W) for _ in range(5))
+        self.w, self.old, self.past, self.b, self.f, self.same = (fem.Function(self.W) for _ in range(6))
         self.u, self.p = (self.w.sub(0), self.w.sub(1)) if wet else (self.w, None)
 
 
@@ -103,14 +115,17 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton without state, and pore fluid, whose pressure is zero at the start.
+        Skeleton without state, and pore fluid.
     walls
         Sides with the components that are zero there, such as {"left": "xy"}.
     conditions
         `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides, nodal pressures on whole facets of a region; other
         sides are free and sealed.
+    pressure : Pa
+        Pore pressure at the start, or a function of places x (m, d), m.  Soil has no stress then, so loads have to
+        balance a pressure that is not zero, or its strain does.
     gravity : callable t -> (d,), m/s^2
-        Acceleration of gravity, without fluid only.
+        Acceleration of gravity.
     terms
         The user's, as those of `Simulation`, none on sides: see `user_functions`, `Source`.
         q is a test function of the pressure's elements.
@@ -133,6 +148,7 @@ class BiotFEM:
         walls: Mapping[str, str],
         conditions: Sequence[Traction | Pressure | RigidPlate | Drained] = (),
         fluid: Fluid | None = None,
+        pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         gravity: Callable[[float], ArrayLike] | None = None,
         terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
@@ -155,8 +171,6 @@ class BiotFEM:
             raise ValueError("drained sides and sources need a fluid")
         if any(outlet.seepage for outlet in drained):
             raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
-        if fluid is not None and gravity is not None:
-            raise ValueError("gravity with a fluid: the reference has none, one of them must be left out")
         fields = (material.porosity, material.biot, material.grain_bulk)
         if material.state or material.unknowns or any(map(callable, fields)):
             raise ValueError(
@@ -171,7 +185,15 @@ class BiotFEM:
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
+        self._pores = Pores(self.grid.mesh, material.retention if fluid else None, self.scale)
+        self._whole = fem.Constant(self.grid.mesh, 1.0)
+        """Share of the slope of k_r that the tangent has."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
+        if fluid is not None:
+            start = fem.Function(self._space.of_p)
+            start.interpolate(partial(self._begin, pressure))
+            for w in (self._space.w, self._space.old, self._space.same):
+                w.x.array[self._space.p_dofs] = start.x.array / self.scale
         self._bcs = self._conditions(with_axis(self.grid, walls), drained if element == "taylor-hood" else ())
         start = time.perf_counter()
         self._plates = [(plate, self._area(plate)) for plate in plates]
@@ -285,7 +307,8 @@ class BiotFEM:
         F, F_n = (ufl.variable(self._deformation(f)) for f in (u, u_n))
         J, J_n = ufl.det(F), ufl.det(F_n)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
-        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * p * ufl.diff(J, F)
+        felt = self._pores.of("bishop", p) * p
+        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * felt * ufl.diff(J, F)
         residual, flux = around * ufl.inner(P, self._grad(v)) * dx, None
         points = SimpleNamespace(  # the configuration at the start of the step
             dx=PointMeasure(self.grid.mesh, around * J_n, "everywhere", degree),
@@ -300,8 +323,9 @@ class BiotFEM:
         for term in terms:
             more = {"u": u - u_n, "v": v, "dt": since, "velocity": (u - u_n - past) / dt}
             residual += 1 / scale * term_of(term, space.w, test, **seen, **more)[0]
+        pull = None if gravity is None else self._constant(np.zeros(self.grid.dim))
         if self.fluid:
-            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets)
+            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets, pull)
             flux -= sum(dt * form_of("sources", source, **seen, q=q, p=scale * p) for source in sources)
             residual += around * content * dx + flux
             flux = _compat.compiled(flux)
@@ -319,8 +343,12 @@ class BiotFEM:
             else:
                 dead.append(self._on(load, ufl.inner(value, v) / scale))
         if gravity is not None:
-            given.append((partial(self._weight, gravity), weight := self._constant(np.zeros(self.grid.dim))))
-            dead.append(around * ufl.inner(weight, v) / scale * dx)
+            given.append((partial(self._acceleration, gravity), pull))
+            solid = self._constant((1 - law.porosity) * law.grain_density)
+            dead.append(around * solid * ufl.inner(pull, v) / scale * dx)
+            if self.fluid:
+                weight = self._constant(self.fluid.density) * self._held(J, p) * pull
+                residual -= around * ufl.inner(weight, v) / scale * dx
         tangent = ufl.derivative(residual, space.w, ufl.TrialFunction(space.W))
         load = _compat.compiled(sum(dead)) if dead else None
         return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
@@ -342,41 +370,78 @@ class BiotFEM:
         """Return the components of a tensor along the axes of the grid."""
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
-    def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None):
-        """Return the change of the content, weighted by q, and the flux in a time dt, s, as UFL."""
+    def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures at the start (n,), Pa, at places (3, n), m, of the mesh."""
+        n, places = x.shape[1], x[: self.grid.dim].T + self.grid.base
+        values = pressure(places) if callable(pressure) else pressure
+        return np.broadcast_to(numbers("pressure", values, (), (n,), allowed="a number, or one for each place"), n)
+
+    def _held(self, J, p):
+        """Return the volume of the fluid in the pores, per volume of the reference, as UFL."""
+        return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
+
+    def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
+        """Return the change of the content, weighted by q, and the flux in a time dt, s, as UFL; pull: of gravity."""
         law, J = self.material, ufl.det(F)
         # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
         S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
         n, n_n = (1 - self._constant(1 - law.porosity) / volume for volume in (J, J_n))
         a, S = self._constant(S_1), self._constant(S_0) + self._constant(S_1 - S_0) * n_n
-        content = J_n * change_of_content(self._constant(law.biot), a, S, J / J_n, p - p_n) * q
+        content = J_n * change_of_content(self._constant(law.biot), a, S, J / J_n, p - p_n)
         compliance = self._constant(self.scale / self.fluid.bulk)
         content *= ufl.exp(compliance * (p + p_n) / 2)
-        p = mass_potential_form(p, compliance)
+        if self._pores.law is not None:
+            full = self._pores.of("saturation", p)
+            content = full * content + (full - self._pores.of("saturation", p_n)) * J_n * n_n * ufl.exp(
+                compliance * p_n
+            )
+        content *= q
         k = self._field(law.conductivity)
         if law.conductivity_law is not None:
             porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
             x = self._places + u
             k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
         kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
-        pull = self._in_plane(ufl.inv(F).T)
+        back = self._in_plane(ufl.inv(F).T)
+        weight = None if pull is None else self._constant(self.fluid.density / self.scale) * pull
         if outlets is not None:
-            return content, self._two_point(kappa, J, pull, p, q, outlets)
+            return content, self._two_point(kappa, F, back, p, q, outlets, weight)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
-        return content, self._around * kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
+        drives = back * ufl.grad(mass_potential_form(p, compliance))
+        if weight is not None:
+            drives -= ufl.exp(compliance * p) * weight
+        kappa *= self._pores.of("relative_permeability", self._seen)
+        return content, self._around * kappa * J * ufl.inner(drives, back * ufl.grad(q)) * dx
 
-    def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
-        """Return the two-point flux between cells and to drained sides, half a cell away, as UFL; p: mass potential."""
+    @property
+    def _seen(self):
+        """Pressure, over `scale`, by which soil conducts, as UFL: with its slope or without, see `_restrained`."""
+        now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
+        return self._whole * now + (1 - self._whole) * same
+
+    def _two_point(self, kappa, F, back, p, q, outlets: Sequence[Drained], weight):
+        """Return the two-point flux between cells and to drained sides, half a cell away, as UFL; weight: of fluid."""
+        compliance = self._constant(self.scale / self.fluid.bulk)
+        pi = mass_potential_form(p, compliance)
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
-        stretch = J * ufl.inner(pull * normal, pull * normal)
+        stretch = ufl.det(F) * ufl.inner(back * normal, back * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
         harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + TINY)
         around = self._around("+") if self.grid.axisymmetric else 1.0
-        flux = around * harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
+        way = across * self._in_plane(F) * normal
+        seen, drives = self._seen, ufl.jump(pi)
+        if weight is not None:
+            fall = ufl.dot(weight("+"), (way("+") - way("-")) / 2)
+            drives += density_between(p("+"), p("-"), compliance) * fall
+        share = self._pores.between(seen("+"), seen("-")) * ufl.avg(stretch) / across("+")
+        flux = around * harmonic * share * drives * ufl.jump(q) * dS
         for o in outlets:
-            outer = mass_potential(o.pressure, self.fluid.bulk) / self.scale
-            flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(outer)) * q)
+            outer = self._constant(o.pressure / self.scale)
+            drives = pi - self._constant(mass_potential(o.pressure, self.fluid.bulk) / self.scale)
+            if weight is not None:
+                drives += density_between(p, outer, compliance) * ufl.dot(weight, way / 2)
+            flux += self._on(o, 2 * kappa * self._pores.between(seen, outer) * stretch / across * drives * q)
         return flux
 
     def _solver(self) -> PETSc.SNES:
@@ -413,8 +478,10 @@ class BiotFEM:
         A.assemble()
 
     def _take(self, x: PETSc.Vec) -> None:
-        x.copy(_compat.petsc_vec(self._space.w))
-        self._space.w.x.scatter_forward()
+        space = self._space
+        x.copy(_compat.petsc_vec(space.w))
+        space.w.x.scatter_forward()
+        space.same.x.array[:] = space.w.x.array
 
     def _assemble(self, out: fem.Function, form) -> PETSc.Vec:
         out.x.array[:] = 0.0
@@ -433,10 +500,10 @@ class BiotFEM:
         self._t.value += dt
         return newton, worst
 
-    def _weight(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
-        """Return the weight (d,), N/m^3, at time t, s."""
-        d, density = self.grid.dim, (1 - self.material.porosity) * self.material.grain_density
-        return density * numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
+    def _acceleration(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
+        """Return the acceleration of gravity (d,), m/s^2, at time t, s."""
+        d = self.grid.dim
+        return numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
         """Solve for the end of a substep of a step dt, s; return Newton iterations, relative residual."""
@@ -461,15 +528,47 @@ class BiotFEM:
         petsc.set_bc(x, self._bcs)
         round_off = ROUND_OFF * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
         snes.setTolerances(self.tolerance, max(self.tolerance * load, round_off), 0.0)
-        snes.solve(None, x)
-        norms, _ = snes.getConvergenceHistory()
+        norms, reason = self._free(x) if self._pores.law is None else self._restrained(x)
         scale = max(load, norms[0], round_off / self.tolerance)
-        if snes.reason < 0:
+        if reason < 0:
             parts = self._parts(x, scale)
             self._take(_compat.petsc_vec(self._space.old))
-            raise NotConverged(f"PETSc SNES stopped with reason {snes.reason}", [parts])
+            raise NotConverged(f"PETSc SNES stopped with reason {reason}", [parts])
         self._take(x)
-        return snes.its, norms[-1] / scale
+        return len(norms) - 1, norms[-1] / scale
+
+    def _free(self, x: PETSc.Vec) -> tuple[NDArray[np.float64], int]:
+        """Solve by SNES; return the norms of the residuals, and why it has ended."""
+        self._snes.solve(None, x)
+        return self._snes.getConvergenceHistory()[0], self._snes.reason
+
+    def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
+        """Solve as `_free`, by single steps whose pressures are within reach: see `retention.restrained`.
+
+        The slope of k_r, which where weight drives into dry soil turns the direction round, is left out (Celia,
+        Bouloutas and Zarba 1990) at first, and after a step that was out of reach or has raised the residual.
+        """
+        snes, of_p = self._snes, self._space.p_dofs
+        of_p = of_p[of_p < x.getLocalSize()]
+        relative, absolute, small, most = snes.getTolerances()
+        norms: list[float] = []
+        reason, self._whole.value = PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT, 0.0
+        for _ in range(most):
+            before = x.array_r[of_p].copy()
+            snes.setTolerances(0.0, 0.0, small, 1)
+            snes.solve(None, x)
+            (first, last), _ = snes.getConvergenceHistory()
+            norms.append(first)
+            asked = before - x.array_r[of_p]
+            taken = self._pores.reached(before, asked)
+            x.array_w[of_p] = before - taken
+            reached = self.grid.comm.allreduce(np.array_equal(taken, asked), op=MPI.LAND)
+            self._whole.value = float(reached and last < first)
+            if reached and last <= max(absolute, relative * norms[0]):
+                reason = PETSc.SNES.ConvergedReason.CONVERGED_FNORM_RELATIVE
+                break
+        snes.setTolerances(relative, absolute, small, most)
+        return [*norms, last], reason
 
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
         """Return the components (d,), Pa, of a traction at time t, s, or a pressure."""
@@ -525,6 +624,13 @@ class BiotFEM:
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pore pressures (m,), Pa, at reference positions x (m, d) in the body, on every process."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
+
+    def water(self) -> float:
+        """Return the volume of the fluid in the pores, m^d, as at zero pressure, over all processes."""
+        u, p = ufl.split(self._space.w)
+        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
+        held = _compat.compiled(self._around * self._held(ufl.det(self._deformation(u)), p) * dx)
+        return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
         """Return a function's values (m, size) at reference positions x (m, d) in the body, on every process."""
