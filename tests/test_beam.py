@@ -36,7 +36,8 @@ def off(result):
 
 def test_the_tip_is_exact_in_space_and_time(beam):
     errors = off(beam[0])
-    assert errors[0] < 1e-2 and errors[2] < 2.5e-3 and errors[3:].max() < 8e-4, errors
+    # before it drains the tip is off by the cells' own error, 0.19 % in ever smaller steps
+    assert errors[0] < 1e-2 and errors[2] < 2.7e-3 and errors[3:].max() < 5e-4, errors
 
 
 def test_the_tip_is_as_exact_in_half_the_steps_if_their_error_chooses_them():
