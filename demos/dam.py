@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A dam: seepage with a free surface, as the reservoir falls, through soil whose pores drain under suction.
+"""A dam: seepage with a free surface, as the reservoir falls, in soil whose pores drain under suction.
 
-A dam of loam, 6 m high with slopes of 1:2, on an impervious base.  Its pore water is at rest, level with the reservoir,
-5 m, when its other slope is opened; the flow settles to a steady one.  Then the reservoir falls by 2 m in five days,
-and the free surface, p = 0, follows as the soil drains.  Above it water flows under suction (`mpm.VanGenuchten`).  The
-reservoir presses on the slope that it wets, and both slopes are seepage faces above it.
+A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the pore water is level with the reservoir, 5
+m. Then the other slope is opened, and the flow becomes steady.  Then the reservoir falls by 2 m in five days, and the
+free surface, p = 0, follows as the soil drains.  Above it water flows under suction (`mpm.VanGenuchten`).  The
+reservoir loads the wet slope.  Above the water, both slopes are seepage faces.
 
-Check: `flow`, the outflow of a rectangular dam (10 m and 2 m of water at its sides, suction above as at rest, 9.6 m
-wide) over the exact one.  That is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), to which suction adds k / L times the
-difference between its sides of the integral of k_r over the suction, integrated over the height; `steady`, the inflow
-into the dam over its outflow before the reservoir falls; and `drained`, the outflow of a column, as its free surface
-falls from 8 m towards 2 m, over that by finite elements on four times as many cells.
+Checks:
+
+* `flow`: outflow of a rectangular dam over the exact one.  The dam is 9.6 m wide, with 10 m and 2 m of water at its
+  sides, and water at rest above.  The exact flow is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with Kirchhoff's
+  potential, the integral of k_r over the head, in place of the head;
+* `steady`: inflow of the dam over its outflow, before the reservoir falls;
+* `drained`: outflow of a column over that of finite elements on cells a quarter as large.  Its free surface falls from
+  8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: of the reservoir's fall; after it 
 
 @dataclass
 class Dam:
-    """What has been seen in steady flow and at each of `SEEN`: flows, corners and pressures.
+    """Flows, corners and pressures in steady flow and at each of `SEEN`.
 
     flows: (2,), m^2/s, out of both slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
     """
@@ -61,13 +64,13 @@ class Dam:
         self.balance = max(self.balance, result.balance)
 
     def see(self, simulation: mpm.Simulation) -> None:
-        """Keep what is to be seen now."""
+        """Keep the present flows, corners and pressures."""
         self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Lower the reservoir of the dam on cells of size h, m, in so many steps of each length, and of the fall."""
+    """Lower the reservoir of the dam on cells of size h, m, with this number of steps of each length and of the fall."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -142,9 +145,9 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow of a column of 10 m, so many cells high, m, and that by finite elements on quarters of them.
+    """Return the outflow of a column of 10 m, m, and that of finite elements on four times as many cells.
 
-    Its water is level with 8 m at first, and the head at its base 2 m.
+    The free surface is at 8 m at first; the head at the base is 2 m.
     """
     high, head, h = 8.0, 2.0, 10.0 / cells
     grid = mpm.Grid([0, 0], [h, 10.0 + h], [1, cells + 1])
@@ -162,7 +165,7 @@ def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=10, help="steps of each length, and of the fall")

@@ -88,10 +88,11 @@ def test_a_column_drains_under_suction_as_by_finite_elements_on_finer_cells():
 
 @pytest.mark.slow
 def test_the_reservoir_of_the_demo_falls_as_on_finer_cells():
-    """Its flows on cells of 1 m and 0.5 m; what flows in is what flows out in steady flow."""
+    """Its flows on cells of 1 m and 0.5 m: within 3 % in steady flow and after the fall, 12 % as it ends."""
     coarse, fine = (np.array(demo.run(h).flows) for h in (1.0, 0.5))
     assert fine[0] == pytest.approx([-fine[0, 1], fine[0, 1]], rel=1e-4)
-    assert coarse == pytest.approx(fine, abs=0.05 * fine.max())
+    assert coarse[[0, 2, 3]] == pytest.approx(fine[[0, 2, 3]], abs=0.03 * fine.max())
+    assert coarse[1] == pytest.approx(fine[1], abs=0.12 * fine.max())
 
 
 @pytest.mark.slow

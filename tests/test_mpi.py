@@ -28,7 +28,7 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
 
 NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes"
 NAMES = NAMES.split()
-SCENES = [f"mpi_{name}.py" for name in NAMES]
+SCENES = [f"mpi_{name}.py" for name in NAMES] + [pytest.param("mpi_wetting.py", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(

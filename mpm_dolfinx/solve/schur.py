@@ -198,7 +198,7 @@ class LinearSolvers:
             if first and not self.plan.symmetric and self.du.comm.size == 1:
                 renew(self._momentum.K)
             if storage is not None:
-                storage.assemble_tangent(data and data.pieces)
+                storage.assemble_tangent(data and data.pieces, momentum.of_suction(data))
         with Timer("mpm: factorisation"), using(self.scheme.petsc_options, self._unread):
             if storage is None:
                 self.solve_u.setUp()
