@@ -70,7 +70,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Lower the reservoir of the dam on cells of size h, m, with this number of steps of each length and of the fall."""
+    """Lower the reservoir of the dam on cells of size h, m, with so many steps of each length and of the fall."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:

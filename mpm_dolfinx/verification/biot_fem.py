@@ -115,8 +115,7 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton without state, and pore fluid.  Where retention is steep (n above 2.5, an air entry) steps may not
-        converge.
+        Skeleton without state, and pore fluid.  Steps of steep retention (n > 2.5, an air entry) may not converge.
     walls
         Sides with the components that are zero there, such as {"left": "xy"}.
     conditions
