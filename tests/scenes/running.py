@@ -14,6 +14,8 @@ from helpers import without
 from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.points.cutting import centroids
+from mpm_dolfinx.points.material_points import body_of
 from scenes.description import FAR, WATER, Condition, G, RigidTool, Scene
 from scenes.frames import Frame
 from scenes.meshes import mesh_of
@@ -282,7 +284,7 @@ class _Builder:
 
     def options(self, later: list[int]) -> dict:
         scene, frame = self.scene, self.frame
-        out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance)}
+        out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance, renewal=scene.renewal)}
         down = np.zeros(scene.dim)
         down[-1] = -scene.gravity * frame.length / frame.time**2
         if scene.gravity:
@@ -315,7 +317,7 @@ class _Builder:
 class Shown:
     """What a scene shows at a time, in the frame of its description; arrays over its points by places at rest.
 
-    steps: that the run took so far; where some are cut there are more.
+    Where domains are renewed places are those now.  steps: that the run took so far; where some are cut there are more.
     """
 
     place: NDArray[np.float64]
@@ -327,13 +329,16 @@ def shown(built: Built) -> Shown:
     """Return what a simulation shows now."""
     scene, frame, s = built.scene, built.frame, built.simulation
     points, d = s.points, scene.dim
-    start = np.cumsum([0, *map(len, s.bodies)])
-    number = np.searchsorted(start, points.id, side="right") - 1
+    number = body_of(points.id, np.cumsum([0, *map(len, s.bodies)]))
     own = np.isin(number, built.order[: len(scene.bodies)])
-    places = np.concatenate([body.corners().mean(axis=1) for body in s.bodies])[points.id][own]
+    if scene.renewal:  # points are others than those at rest
+        places, rest = points.x[own], centroids(points.origin[own])
+    else:
+        rest = points.origin[own].mean(axis=1)
+        places = np.concatenate([body.corners().mean(axis=1) for body in s.bodies])[points.id][own]
     stress = s.point_fields().effective_stress[own]
     fields = {
-        "displacement": frame.vector_back((points.x - points.origin.mean(axis=1))[own] / frame.length),
+        "displacement": frame.vector_back((points.x[own] - rest) / frame.length),
         "stress": frame.tensor_back(stress / frame.stress),
         "volume": points.J[own] - 1,
     }
