@@ -76,7 +76,7 @@ def test_a_plot_has_the_domains_and_the_values_of_the_points(field, label):
     s.run(0.02, 0.02, progress=False)
     ax = mpm.plot(s, field, cmap="viridis")
     (drawn,) = ax.collections
-    assert len(drawn.get_paths()) == len(s.points) and ax.child_axes[0].get_ylabel() == label
+    assert len(drawn.get_paths()) == len(s.points) and ax.child_axes[0].get_title(loc="right") == label
     wanted = {"pressure": s.points.pressure, "stress_xx": s.point_fields().stress[:, 0, 0], "J": s.points.J}
     wanted["displacement"] = np.linalg.norm(s.points.displacement, axis=1)
     assert np.array_equal(drawn.get_array(), wanted[field])
