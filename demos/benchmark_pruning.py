@@ -113,7 +113,7 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with four layers of alternating conductivity, off the grid lines by a number of cells."""
+    """Return the draining block with four layers of alternating conductivity, at an offset of cells from grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
