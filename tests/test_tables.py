@@ -86,6 +86,24 @@ def test_a_plot_has_the_domains_and_the_values_of_the_points(field, label):
     matplotlib.pyplot.close("all")
 
 
+def test_a_plot_has_the_stress_of_dry_soil_and_the_saturation_of_unsaturated_soil():
+    dry = column(cells=4, fluid=False)
+    (drawn,) = mpm.plot(dry, "stress_yy").collections
+    assert np.array_equal(drawn.get_array(), dry.point_fields().effective_stress[:, 1, 1])
+    grid = mpm.Grid([0, 0], [0.5, 2.5], [1, 5])
+    silt = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-6, retention=mpm.Gardner(1e4))
+    box = mpm.box(grid, [0, 0], [0.5, 2])
+    given = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(1), "gravity": (0, -9.81)}
+    wet = mpm.Simulation(grid, [box], [silt], walls={"bottom": "xy"}, **given)
+    (drawn,) = mpm.plot(wet, "saturation").collections
+    height = wet.points.x[:, 1]
+    assert np.all(drawn.get_array()[height < 1] == 1)
+    assert np.all(np.diff(drawn.get_array()[np.argsort(height)][height[np.argsort(height)] > 1][::2]) < 0)
+    with pytest.raises(ValueError, match="plot: field = 'saturation', must be one of"):
+        mpm.plot(beam(h=0.1)[0], "saturation")
+    matplotlib.pyplot.close("all")
+
+
 def test_what_cannot_be_drawn_is_refused():
     dry = column(cells=4, fluid=False)
     with pytest.raises(ValueError, match=r"plot: field = 'pressure', must be one of displacement, .* porosity, "):
