@@ -158,6 +158,18 @@ def clayey(cells: int) -> mpm.Simulation:
     return block(cells, clay, conditions=[mpm.Traction("top", lambda t: (0, -p - LOAD * t))])
 
 
+LOOSE = {"r": 0.5, "beta": 1e-5, "reference": 1e4}
+
+
+def drying(cells: int, law: type[mpm.ModifiedCamClay], **constants) -> mpm.Simulation:
+    """Return the draining block of overconsolidated clay, whose top gets drier."""
+    p = 1e5  # Pa
+    moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk, "conductivity": 1e-8}
+    clay = law(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), retention=mpm.VanGenuchten(1e6), **moduli, **constants)
+    top = mpm.Traction("top", lambda t: (0, -p - LOAD * t)), mpm.Drained("top", lambda t: -LOAD * t)
+    return block(cells, clay, fluid=mpm.Fluid(), conditions=[*top])
+
+
 def apart(cells: int, **options) -> mpm.Simulation:
     """Return the block with a second body, a quarter as wide, that touches nothing."""
     h = 1 / cells
@@ -221,6 +233,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         partial(plastic, law=mpm.SofteningDruckerPrager, residual=1e8, slip=1e3, viscosity=1.0),
     ),
     "Modified Cam Clay instead of Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
+    "suction in the law": (partial(drying, law=mpm.ModifiedCamClay), partial(drying, law=mpm.BarcelonaBasic, **LOOSE)),
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),

@@ -111,6 +111,7 @@ BENCHMARK = {
     "Mohr-Coulomb instead of Drucker-Prager": set(),
     "softening instead of Drucker-Prager": set(),
     "Modified Cam Clay instead of Drucker-Prager": set(),
+    "suction in the law": set(),
     "mean dilatation": DILATION,
     "plastic law, with mean dilatation": {"state of the law"} | DILATION,
     "finite strain": {"one factorisation for many steps"},
