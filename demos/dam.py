@@ -58,7 +58,7 @@ class Dam:
     steps: int = 0
 
     def run(self, simulation: mpm.Simulation, days: float, steps: int) -> None:
-        """Run for so many days more, in equal steps."""
+        """Run for a number of days, in equal steps."""
         result = simulation.run(simulation.t + days * DAY, days * DAY / steps, progress=False)
         self.wall, self.steps = self.wall + result.wall, self.steps + result.steps
         self.balance = max(self.balance, result.balance)
@@ -70,7 +70,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Lower the reservoir of the dam on cells of size h, m, with so many steps of each length and of the fall."""
+    """Lower the reservoir of the dam on cells of size h, m, with a number of steps for each length and for the fall."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
 
 def rectangular(cells: int) -> float:
-    """Return the flow through a rectangular dam, so many cells high, over the exact one."""
+    """Return the flow through a rectangular dam over the exact one."""
     levels, width, top = (10.0, 2.0), 9.6, 12.0
     h = top / cells
     grid = mpm.Grid([0, 0], [width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])
