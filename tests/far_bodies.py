@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A soft beam, alone or beside a body that it does not touch, which rests, moves, is loaded or drains."""
+"""A soft beam, alone or next to a separate body at rest, in motion, under load or during drainage."""
 
 import numpy as np
 

@@ -60,7 +60,7 @@ def joined(*given):
 
 
 def without(simulation, *kinds):
-    """Return the conditions in force, but for those of some kinds."""
+    """Return the active conditions, except for the given kinds."""
     return [one for one in simulation.conditions if not isinstance(one, kinds)]
 
 
@@ -88,7 +88,7 @@ def limit(simulation, newton):
 
 
 class SetUp(NamedTuple):
-    """The balances at the end of a step's last substep, as if it were the only one, with what it starts from."""
+    """The balances at the end of a step's last substep, taken as the only one, and the start of the step."""
 
     start: Start
     momentum: MomentumProblem
@@ -125,7 +125,7 @@ def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0,
 
 
 def refused_in_one_line(make, name, value, folder, longest):
-    """Assert that a ValueError names the object, the value and what is allowed in one line, shorter than `longest`."""
+    """Assert that a ValueError is one line with object, value and allowed values, shorter than `longest`."""
     with pytest.raises(ValueError) as caught:
         make(folder) if make.__code__.co_argcount else make()
     line = str(caught.value)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Measures of the package's house, counted over its syntax trees: `python -m tests.house` prints them.
 
-A number is *structure* where it can be no other: all that is written below as `structure`.  It is *sourced* where a
-comment beside it, or the string below it, names one of two things:
+A number is *structure* where it cannot be another one: see `structure` below. It is *sourced* if a comment on its line,
+or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
     Plateau (scene): halved a, doubled b, cells c.
 
-The latter are relative changes of the scene's answers: with half and twice the number, and with finer cells.  One of
-the first two is not zero, so the scene knows the number; both are below the third.
-`python tests/plateaus.py` measures them again.  All else is *ad hoc*.
+The latter are relative changes of the scene's answers: with half and twice the number, and with finer cells. One of the
+first two is not zero, so the number affects the scene; both are below the third. `python tests/plateaus.py` measures
+them again. All other numbers are *ad hoc*.
 """
 
 import ast
@@ -27,7 +27,7 @@ SOURCE = re.compile(
 PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-]+), cells ([\d.e+-]*[\d])")
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""
-STYLES = ("figsize", "alpha", "dpi")
+STYLES = ("figsize", "alpha", "dpi", "bounds")
 CONDITIONS = (
     "Traction",
     "Pressure",
@@ -57,13 +57,13 @@ class Module:
 
     @cached_property
     def used(self) -> set[str]:
-        """Names that stand in the code, but those that are only imported."""
+        """Names in the code, without names that are only imported."""
         return {n.id for n in self.nodes if isinstance(n, ast.Name)} | {
             n.name for n in self.nodes if isinstance(n, ast.ClassDef)
         }
 
     def beside(self, node: ast.stmt) -> str:
-        """Return what is said of a statement: comments on its lines and above it, and the string below it."""
+        """Return the comments of a statement: on its lines and above it, and the string below it."""
         first, last = node.lineno - 1, node.end_lineno
         said = [line.partition("#")[2] for line in self.lines[first:last]]
         while first > 0 and self.lines[first - 1].lstrip().startswith("#"):
@@ -125,7 +125,7 @@ def structure(value: ast.AST) -> bool:
 
 
 def named():
-    """Yield (where, name, what is said) of all numbers in capitals that are no structure."""
+    """Yield (where, name, comments) of all numbers in capitals that are not structure."""
     for module in modules():
         for node in module.tree.body:
             if isinstance(node, ast.AnnAssign) and node.value is not None:
@@ -138,13 +138,13 @@ def named():
 
 
 def plateau(said: str):
-    """Return (scene, halved, doubled, cells) of what is said of a number, None where it names no plateau."""
+    """Return (scene, halved, doubled, cells) from the comments of a number, None without a plateau."""
     found = PLATEAU.search(said)
     return found and (found[1], *map(float, found.groups()[1:]))
 
 
 def sourced(said: str) -> bool:
-    """Return whether what is said of a number names its source, or a plateau: what is felt, but less than the cells."""
+    """Return whether the comments of a number have a source, or a plateau: an effect, but smaller than the cells'."""
     flat = plateau(said)
     return bool(SOURCE.search(said)) or bool(flat and 0 < max(flat[1:3]) < flat[3])
 
@@ -159,12 +159,7 @@ def inline() -> list[str]:
     for module in modules():
         within = [n for n in module.nodes if isinstance(n, ast.FunctionDef | ast.Lambda)]
         chosen = {m for f in within for d in [*f.args.defaults, *f.args.kw_defaults] if d for m in literals(d)}
-        styles = {
-            m
-            for n in module.nodes
-            if isinstance(n, ast.keyword) and n.arg in ("figsize", "alpha", "dpi")
-            for m in literals(n)
-        }
+        styles = {m for n in module.nodes if isinstance(n, ast.keyword) and n.arg in STYLES for m in literals(n)}
         checks = {m for n in module.nodes if isinstance(n, ast.Compare) and len(n.ops) > 1 for m in literals(n)}
         factors = {
             m
@@ -246,7 +241,7 @@ def _slot(index: ast.AST) -> bool:
 
 
 def hidden() -> list[str]:
-    """Return where a method changes what its object holds without setting an attribute, or a function a global.
+    """Return where a method changes the contents of its object without setting an attribute, or a function a global.
 
     self.x[0] += 1, self.x[:] = y, self.x[()] = y; self._x.append, clear, update, pop and add outside of __init__;
     `global`; attributes of functions; names of a module's own lists and dictionaries whose entries are set.
@@ -280,7 +275,7 @@ def _changes(node: ast.AST, functions: set[str]) -> bool:
 
 
 def rooms(name: str) -> list[str]:
-    """Return the modules in which the name of a class stands, but those that only export it."""
+    """Return the modules that use the name of a class, without modules that only export it."""
     return [m.where for m in modules() if m.path.name != "__init__.py" and name in m.used]
 
 
@@ -310,7 +305,7 @@ def measures() -> dict[str, float]:
 
 
 def main(arguments: list[str]) -> None:
-    """Print the measures, and with --list what they count."""
+    """Print the measures, and with --list the counted places."""
     for name, value in measures().items():
         print(f"{value:9g}  {name}")
     if "--list" in arguments:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Boxes as meshes of meshio, with their sides named as those of `box`."""
+"""Boxes as meshes of meshio, with the side names of `box`."""
 
 from itertools import permutations
 

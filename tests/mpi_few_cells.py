@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run blocks on grids of few cells, of which a process may have none, or none with a face; write where they end."""
+"""Run blocks on grids of few cells, with processes without cells or faces; write the final positions."""
 
 import sys
 

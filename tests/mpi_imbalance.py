@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Dig half of a body away on however many processes there are; write how even the work is, and what was sent."""
+"""Excavate half of a body on any number of processes; write load balance and amounts of communication."""
 
 import sys
 
@@ -17,7 +17,7 @@ simulation = mpm.Simulation(
 
 
 def measured(t_end):
-    """Return the reported imbalance and memory of a run, and on rank 0 what all processes have."""
+    """Return the reported imbalance and memory of a run, and on rank 0 the values of all processes."""
     result = simulation.run(t_end, 0.5, progress=False)
     pieces = simulation.scene.last[0].data.pieces
     mine = (len(simulation.points), len(pieces.cells), len(pieces.places.filled))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a sheared block with files beside it on however many processes there are; argument: a folder."""
+"""Run a sheared block with output files on any number of processes; argument: a folder."""
 
 import sys
 

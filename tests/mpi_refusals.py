@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What only one of several processes can see is refused by all, in the same words."""
+"""All processes raise the same error, even if only one of them can see its cause."""
 
 import warnings
 from dataclasses import replace

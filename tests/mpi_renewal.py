@@ -13,7 +13,7 @@ CLAY = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3, con
 
 
 def pushed(cells=8, renewal=True, wet=False):
-    """Return a simulation of a disc that goes into a block beside a pressure, with so many cells across."""
+    """Return a simulation of a disc pushed into a block next to a pressure, with so many cells across."""
     grid = mpm.Grid([0, 0], [1.0, 1.2], [cells, 5 * cells // 4])
     block = mpm.box(grid, [0, 0], [1.0, 0.83])
     disc = mpm.Tool(mpm.Ball((0, 1.13), 0.3), lambda t: (0, -t), adhesion=100.0)

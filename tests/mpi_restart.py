@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints on several processes; arguments: one of a single process, one to write, the state to write.
 
-Resumes the first and goes on to the end; writes the second half way, and files beside it; runs and resumes on as
+Resumes the first one and runs to the end; writes the second one half way, with output files; runs and resumes on as
 many processes.
 """
 

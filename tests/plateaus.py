@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What half and twice of a number change in the answers of a small scene: `python tests/plateaus.py` measures all.
+"""Changes of the answers of a small scene with half and twice a number: `python tests/plateaus.py` measures all.
 
-Arguments are numbers and scenes, as domains/lattice.py:FAST@cycles; without any all are measured that name a plateau,
-see `house`.  The change is the largest of a scene's answers, relative to each; beside it stands that of finer cells.
+Arguments are numbers and scenes, as domains/lattice.py:FAST@cycles; without arguments all numbers with a plateau are
+measured, see `house`. The change is the largest relative change of a scene's answers, followed by that of finer cells.
 """
 
 import importlib
@@ -34,7 +34,7 @@ def bent(h: float, nu: float = 0.0) -> dict[str, float]:
 
 
 def cycled(h: float) -> dict[str, float]:
-    """A beam without water, loaded and released twice: its tip, and what is left of its stress, over the first peak."""
+    """A dry beam, loaded and unloaded twice: its tip, and its residual stress over the first peak."""
     run = cycles.cycle(h, 54e3, 2, 10)
     return {"tip": run["tips"][5], "left": 1 + run["left"][-1]}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What tests of properties draw; how many examples they take, always the same ones."""
+"""Random input of property tests, and their number of examples, which are always the same."""
 
 from functools import cache
 

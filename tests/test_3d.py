@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""In 3D: plane strain is recovered, iterations do what factors do, a bent body is what it is bent to."""
+"""3D: plane strain is recovered, iterations and factors agree, and a bent body takes the prescribed shape."""
 
 import json
 import os
@@ -90,7 +90,7 @@ def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid,
 
 
 def test_memory_does_not_grow_with_the_steps():
-    """petsc4py keeps what Python has dropped until it is told to let go: 4 MB a step here."""
+    """petsc4py keeps objects that Python has dropped until it is told to free them: 4 MB a step here."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, growth_3d.__file__], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -21,7 +21,7 @@ def scene(wet, load):
 
 
 def noted(change):
-    """Return what alters the note of a checkpoint."""
+    """Return a function that alters the note of a checkpoint."""
 
     def alter(arrays):
         note = json.loads(str(arrays["note"]))
@@ -31,7 +31,7 @@ def noted(change):
 
 
 def rows(name, change):
-    """Return what alters an array of a checkpoint."""
+    """Return a function that alters an array of a checkpoint."""
 
     def alter(arrays):
         arrays[name] = change(arrays[name])

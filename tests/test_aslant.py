@@ -42,7 +42,7 @@ def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
 
 
 def consolidated(cells, angle, time):
-    """Return the error of the cells' pressures (rms) and of the outflow, over those at the start and exact ones."""
+    """Return the errors of the cells' pressures (rms) and of the outflow, over initial and exact values."""
     s, along = turned(cells, angle, [(1, 0.0)], pressure=START)
     for end, steps in ((1e-2, 6), (time, 10)):
         s.run(end / CONSOLIDATION, (end / CONSOLIDATION - s.t) / steps, progress=False)
@@ -84,7 +84,7 @@ def test_a_slanted_seepage_face_lets_out_what_flows_to_it(angle):
 
 @pytest.mark.parametrize("length", [1e-4, 1e3])
 def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
-    """What sealed sides tell counted 1 / h^2 times as much, h in metres: in millimetres 3 % more flowed out."""
+    """Equations of no-flow sides had a weight of 1 / h^2, h in metres: in millimetres 3 % more flowed out."""
 
     def flow(size):
         grid = mpm.Grid([0] * 2, [1.6 * size] * 2, [12, 12])

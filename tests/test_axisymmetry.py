@@ -199,7 +199,7 @@ def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
 
 
 def test_a_well_half_a_cell_in_radius_takes_what_flows_to_it():
-    """Rings between its face and the first centroid are longer than those at the face: 8 % too little flowed."""
+    """Rings between its face and the first centroid are longer than rings at the face: 8 % too little flowed."""
     grid = mpm.Grid([0.05, 0], [1.05, 0.2], [10, 2], axisymmetric=True)
     s = mpm.Simulation(
         grid,
@@ -253,7 +253,7 @@ def test_a_rough_circular_footing_carries_what_limit_analysis_says():
     ],
 )
 def test_laws_with_a_state_see_the_hoops(material, confinement):
-    """A triaxial test of a cylinder is that of a point, but for what its top gives way within the push."""
+    """A triaxial test of a cylinder equals one of a point, up to the penalty gap of its top within the push."""
     s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 4)))
     s.step(1.0)
     height, side = s.points.corners[:, :, 1].max(), s.conditions[:1]
@@ -314,7 +314,7 @@ def slice_or_ring(inner):
 
 
 def test_a_ring_far_from_the_axis_is_a_slice(monkeypatch):
-    """But for the flow beside the two-point fluxes where bodies lie aslant, which rings do without."""
+    """The non-orthogonal flux correction is excluded: rings have none."""
     monkeypatch.setattr(on_grid, "off_facets", lambda contents, facets: facets[:0])
     flat, ring = slice_or_ring(0.0), slice_or_ring(RADIUS)
     moved = [s.points.x - s.points.origin.mean(axis=1) for s in (flat, ring)]

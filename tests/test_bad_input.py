@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bad input gets one line that names the object, the value and what is allowed, before any work."""
+"""Bad input is refused before any work, in one line with object, value and allowed values."""
 
 import numpy as np
 import pytest

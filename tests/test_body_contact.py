@@ -186,7 +186,7 @@ def test_the_contact_bears_what_is_on_it_as_bodies_come_and_go(wet):
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_plate_presses_bodies_of_two_groups_evenly(order):
-    """They stand beside each other, with other spacings; each gives back what it took, and the plate parts."""
+    """The bodies stand side by side, with different spacings; both recover elastically, and the plate parts."""
     grid, y = mpm.Grid([0, 0], [2, 2], [8, 8]), 0.85
     bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [1, 0], [2, y], per_cell=3)][::order]
     plate = mpm.Tool(mpm.HalfSpace([1, y + 0.01], [0, -1]), displacement=lambda t: (0, -0.1 * np.sin(np.pi * t)))
@@ -354,7 +354,7 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
 
 @pytest.mark.slow
 def test_a_disc_rolls_between_two_bodies():
-    """Held at first, then only by friction: it goes half as far as what lies on it, and turns as far as that."""
+    """Held at first, then by friction only: it moves half as far as the upper body, and turns accordingly."""
     n, R, y = 8, 0.5, 1.3
     grid, c, on = mpm.Grid([0, 0], [4, 2], [4 * n, 2 * n]), np.array([1.5, y - R]), ([1, 0.75], [1.1, 0.85])
     round_off = lambda x: c + (x - c) * np.sqrt(1 - ((x - c) / R)[:, ::-1] ** 2 / 2)  # noqa: E731

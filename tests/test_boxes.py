@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a lattice are known by a few numbers, and say of their domains what arrays of them would."""
+"""Bodies of boxes on a lattice store few numbers, and return the same domains as arrays would."""
 
 import tracemalloc
 from dataclasses import replace

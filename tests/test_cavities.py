@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Cylindrical cavities that are widened in Modified Cam Clay and Mohr-Coulomb soil, beside exact pressures.
+"""Expanding cylindrical cavities in Modified Cam Clay and Mohr-Coulomb soil, compared with exact pressures.
 
-The laws on radial grids, and scenes on a grid that knows nothing of circles.
+The laws on radial grids, and scenes on a Cartesian grid.
 """
 
 from dataclasses import replace
@@ -42,7 +42,7 @@ def test_clay_that_yields_from_the_start_is_integrated_to_first_order():
 
 
 def test_a_drained_well_in_cam_clay():
-    """Chen and Abousleiman (2013), whose indices are those of v over the Cauchy stress."""
+    """Chen and Abousleiman (2013); their indices are slopes of v over the Cauchy stress."""
     v, stress = 2.064, (-100e3, -100e3, -160e3)
     lambda_, kappa = (index / v / (1 - index / v) for index in (0.15, 0.03))
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=4302e3, initial_stress=stress)

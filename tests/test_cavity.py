@@ -69,7 +69,7 @@ def pressures(cells, bulk, marks, outer):
 
 
 def radial(bulk, outer):
-    """Return what `exact` does by radial elements, of soil with a bulk modulus over G."""
+    """Return the solution of `exact` by radial elements, for soil with a bulk modulus over G."""
     hole, found = cavity(soil(bulk), outer, 150), []
     for a in np.unique(np.round([*np.linspace(1.0025, 1.1, 40), *np.linspace(1.11, MARKS[-1], 90), *MARKS], 9)):
         hole = hole.widened(a)
@@ -96,7 +96,7 @@ def test_a_cavity_is_widened_in_soil_that_flows(bulk):
 @pytest.mark.parametrize("bulk", [10, 1000])
 @pytest.mark.parametrize(("cells", "error"), [(8, 0.015), (16, 0.005)])
 def test_pressures_in_a_cavity_converge(cells, error, bulk, monkeypatch):
-    """Undrained up to twice its radius; the radial elements are those of incompressible soil with K = 1000 G."""
+    """Undrained up to twice its radius; the radial elements are for nearly incompressible soil, K = 1000 G."""
     monkeypatch.setattr("mpm_dolfinx.verification.cavity.NEAR", 1e-6)  # what soil that flows evenly lets them reach
     reference = radial(bulk, NEAR)
     if bulk == 1000:

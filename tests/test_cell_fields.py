@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the cells hold: of second order, of the present, and nothing that a run would notice."""
+"""Fields of the cells: of second order, up to date, and without any effect on a run."""
 
 import manufactured as made
 import numpy as np
@@ -10,7 +10,7 @@ import mpm_dolfinx as mpm
 
 
 def test_fields_of_the_cells_are_of_second_order():
-    """Displacement, pressure, effective and total stress, at the centroids of what the cells hold."""
+    """Displacement, pressure, effective and total stress, at the centroids of the material in the cells."""
     errors = []
     for cells in (6, 12, 24):
         s = made.scene(cells)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What dolfinx does not promise but forms at points rely on: a new release fails here first."""
+"""Undocumented behaviour of dolfinx on which forms at points rely: a new release fails here first."""
 
 import subprocess
 import sys

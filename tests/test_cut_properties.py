@@ -196,7 +196,7 @@ def parts_of_polygon(polygon):
 
 
 def conditioned(polygon, slack):
-    """Return area, perimeter and centroid of a polygon, of which vertices that move so little leave nearly all."""
+    """Return area, perimeter and centroid of a polygon, without vertices that small shifts hardly change."""
     area, moment = area_and_moment(polygon)
     perimeter = sum(np.hypot(*(float(x - w) for x, w in zip(a, b, strict=True))) for a, b in edges(polygon))
     assume(slack * perimeter < 1e-3 * area)
@@ -243,7 +243,7 @@ def section(polygon, axis, plane):
 
 
 def beside(polygon, axis, plane):
-    """Return how much of the outline is near a line, seen along it, and not on it: what is flat there counts as on."""
+    """Return the length of the outline near a line but not on it, seen along it; flat parts count as on it."""
     out = 0.0
     for a, b in edges(polygon):
         low, high = sorted([float(a[axis] - plane), float(b[axis] - plane)])
@@ -321,7 +321,7 @@ def columns(tetrahedra, axes):
 @repeatable(80)
 @given(hexahedra(folds=True))
 def test_a_hexahedron_has_the_pieces_of_its_tetrahedra(scene):
-    """Those that have folded count as positive."""
+    """Inverted tetrahedra count as positive."""
     grid, corners = scene
     found, y, slack, parts = pieces(grid, corners), snapped(grid, corners), error(grid, corners), {}
     for cell, tetrahedra in columns(tetrahedra_of(y), (0, 1, 2)).items():
@@ -372,7 +372,7 @@ def test_a_face_is_open_where_the_body_is_no_further_from_it_than_the_snap(d, ga
 
 @st.composite
 def surfaces(draw, d):
-    """A grid, and the corners (2^(d-1), d), m, of a face of a domain, plane or not, and those of a unit cube's face."""
+    """A grid, and the corners (2^(d-1), d), m, of a face of a domain, plane or not, and of a unit cube's face."""
     local = np.insert(BITS[d - 1].astype(float), draw(st.integers(0, d - 1)), draw(st.integers(0, 1)), axis=1)
     y = (local - 0.5 + numbers(draw, -0.2, 0.2, *local.shape)) * orders(draw, -4, 0.5) * orders(draw, -3, 0, d)
     return *in_a_grid(draw, put_near_planes(draw, numbers(draw, 0, 1, d) + turned(draw, y))), local
@@ -389,7 +389,7 @@ def squares(simplices, d):
 
 
 def parts_of_simplices(simplices, d):
-    """Return {cell: segments or triangles that fill the part in it}, of those with the first d coordinates in cells."""
+    """Return {cell: segments or triangles that fill the part in it}; the first d coordinates are in cells."""
     out = {}
     for simplex in simplices:
         for cell in product(*(span(simplex, axis) for axis in range(d))):
@@ -431,7 +431,7 @@ def test_points_on_a_face_integrate_what_is_quadratic_in_each_cell(d):
 
 @pytest.mark.parametrize("order", [(1, 0, 2), (0, 2, 1), (2, 1, 0)])
 def test_points_on_a_face_do_not_tell_which_axis_was_cut_first(order):
-    """They did: what a tool presses by in 3D, which is no polynomial, changed with the names of the axes."""
+    """Earlier the tool pressure in 3D, which is not a polynomial, changed with the names of the axes."""
 
     order, rng = list(order), np.random.default_rng(0)
     grid, waves = Grid([0, 0, 0], [3.0, 4.0, 5.0], [3, 5, 4]), np.array([2.0, 3.0, 4.0])
@@ -449,7 +449,7 @@ def test_points_on_a_face_do_not_tell_which_axis_was_cut_first(order):
 
 
 def test_pieces_in_3d_have_the_moments_of_products_of_what_they_are():
-    """Those of a turned box, and those of its eight parts summed in each cell."""
+    """The moments of a rotated box equal the sums over its eight parts in each cell."""
     rng = np.random.default_rng(0)
     grid, F = Grid([0, 0, 0], [3.0, 2.0, 4.0], [3, 4, 5]), np.eye(3) + 0.3 * rng.normal(size=(3, 3))
     x, whole = np.array([[1.4, 1.1, 1.9]]), np.full((1, 3), 0.7)

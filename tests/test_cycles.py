@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body that comes back is the body that left: cycles, turns, and what moves the domains' corners."""
+"""A body returns to its initial state after cycles and rotations, and corners move as they should."""
 
 from dataclasses import replace
 from functools import cache
@@ -31,7 +31,7 @@ def test_a_beam_is_free_of_stress_after_cycles():
 
 
 def told(run):
-    """Print what half of the cycles and all leave of the stress, the drift of the peaks, and the tip without load."""
+    """Print residual stress after half and all of the cycles, the drift of the peaks, and the tip without load."""
     left, peaks, rest = run["left"], run["tips"][5::10], run["tips"][::10]
     numbers = ", ".join(f"{x:.3%}" for x in (left[len(left) // 2 - 1], left[-1]))
     print(f"left {numbers}, peaks {peaks[-1] / peaks[0] - 1:.1e}, tip {rest[-1] / peaks[0]:.1e}")
@@ -88,7 +88,7 @@ def test_what_cycles_leave_falls_with_the_cell_size():
 
 
 def left_of(h, dim=2, **wet):
-    """Return what three cycles leave of the effective stress of a cantilever, rms over its peak."""
+    """Return the residual effective stress of a cantilever after three cycles, rms over its peak."""
     grid = mpm.Grid(
         [0] * dim, [1.2, *[0.4] * (dim - 2), 1.2], np.rint(np.array([1.2, *[0.4] * (dim - 2), 1.2]) / h).astype(int)
     )
@@ -123,7 +123,7 @@ def test_what_cycles_leave_falls_with_the_cell_size_draining_and_in_3d_as_well(h
 
 @pytest.mark.slow
 def test_what_undrained_cycles_leave_falls_slowly_only_where_a_clamp_has_edges():
-    """Stresses there are those of r^(x - 1), x = 0.595: with springs in the clamp's place the order is 1.35."""
+    """Stresses at an edge behave as r^(x - 1), x = 0.595: with springs in place of the clamp the order is 1.35."""
     soil = {"material": replace(clay(0.0), conductivity=0.0), "fluid": mpm.Fluid()}
     sprung, clamped = ([cycles.cycle(h, 54e3, 5, 10, springs=k, **soil) for h in (0.06, 0.03)] for k in (5e7, 0.0))
     assert cycles.orders([0.06, 0.03], [run["left"][-1] for run in sprung])[0] > 1.3
@@ -138,7 +138,7 @@ def test_undrained_more_of_the_stress_is_left_as_where_it_is_nearly_incompressib
 
 
 def test_what_undrained_cycles_leave_is_bounded():
-    """What is owed to the points is paid back: without, 3.9 and 5.3 % were left after 5 and 10 cycles, and so on."""
+    """The volume defect of points is corrected: without, 3.9 and 5.3 % were left after 5 and 10 cycles, and so on."""
     soil = replace(clay(0.0), conductivity=0.0)
     left = cycles.cycle(0.06, 54e3, 10, 10, material=soil, fluid=mpm.Fluid())["left"]
     assert left[-1] < 0.039 and left[-1] < 1.1 * left[4], left
@@ -150,9 +150,9 @@ def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
 
 @pytest.mark.slow
 def test_a_stretched_block_after_ten_turns_is_that_after_one():
-    """The stress that sides carry turns with them: the first turn leaves 1e-6 E, those after it less and less.
+    """The carried traction of sides rotates with them: the first turn leaves 1e-6 E, later ones less and less.
 
-    Were it fixed in space, sides would give way to its turn in each step: 2.6e-5 E.
+    A traction fixed in space would let sides give way to its rotation in each step: 2.6e-5 E.
     """
     grid, centre = mpm.Grid([0, 0], [1.6, 1.6], [8, 8]), np.full(2, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3)

@@ -52,7 +52,7 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
 
 
 def test_water_in_a_nearly_incompressible_beam_has_its_pressure():
-    """Pressed out anew in each step by what corners tell it had up to thirty times that; steps by error never grew."""
+    """The corner-based volume ratio expelled water in each step: up to thirty times the pressure, steps never grew."""
     wet = Beam(extreme_soil(nu=0.499), WATER)
     fem = BiotFEM([0, 0], wet.size, (20, 8), wet.material, walls={"left": "xy"}, **wet.physics())
     reference = fem.run(0.2, 0.02, probes=[[1.0, 0.2]])

@@ -29,7 +29,7 @@ def balance(e):
 
 
 def bars(n, speed=0.05, drift=0.0):
-    """Return two bars, 1 m long, that fly towards each other, c dt = h = 1/n m, beside grid lines."""
+    """Return two bars, 1 m long, that fly towards each other, c dt = h = 1/n m, off the grid lines."""
     h = 1 / n
     count = 3 * n + round(2.6 * abs(drift) / h)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
@@ -178,7 +178,7 @@ def test_a_hammer_comes_back_as_fast_as_it_should():
 
 @pytest.mark.slow
 def test_a_heavy_hammer_keeps_its_energy_to_a_hundredth():
-    """What is lost is that of the bar's first half cell, which the hammer meets at once."""
+    """The loss is the energy of the bar's first half cell, which the hammer meets at once."""
     t, back = struck(2.0, 1.0)
     s = hammer(20, 2.0)
     e = s.run(np.ceil(40 * (t + 0.4)) / 40, 0.025, energies=True, progress=False).energies

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Energies and works balance, and each is what it says."""
+"""Energies and works balance, and each has its exact value."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def off(result):
 
 
 def test_what_a_pulse_brings_leaves_through_a_quiet_base():
-    """Exact: int q^2 / (rho c) dt, of q sin^2 in time, is 3/8 of what the whole load would bring."""
+    """Exact: int q^2 / (rho c) dt, with q sin^2 in time, is 3/8 of the value for a constant load."""
     load = mpm.Traction("top", lambda t: (0, -1e3 * pulse(t, 0.1)))
     s = column(conditions=[load, mpm.Quiet("bottom")])
     result = s.run(0.18, HEIGHT / 20 / C_P, energies=True, progress=False)
@@ -29,7 +29,7 @@ def test_what_a_pulse_brings_leaves_through_a_quiet_base():
 
 
 def test_energies_of_a_column_that_vibrates_under_its_weight_on_a_base_that_moves_balance():
-    """What dissipates is an error, of the work of stresses against the energy of the law: of second order."""
+    """Dissipation is an error here, of the work of stresses against the law's energy: of second order."""
     base, lost = mpm.Displacement("bottom", lambda t: (0, 1e-3 * np.sin(30 * t) ** 2), "y"), []
     for n in (5, 10):
         s = column(n, [base], gravity=(0, -9.81))
@@ -50,7 +50,7 @@ def test_a_block_that_falls_gains_what_its_weight_does():
 
 
 def test_soil_that_yields_dissipates_what_is_lost():
-    """A wall of clay thrown aside on its foot comes to rest; its stresses store what Hencky's law says."""
+    """A wall of clay thrown aside on its foot comes to rest; its stresses store the energy of Hencky's law."""
     grid = mpm.Grid([0, 0], [2.4, 1.2], [16, 8])
     wall = mpm.box(grid, [0.6, 0], [1.2, 0.9])
     velocity = lambda x: np.stack([2 * x[:, 1], 0 * x[:, 1]], axis=1)  # noqa: E731

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the package finds around it: what is installed, folders that cannot be written, what other runs have left."""
+"""The environment of the package: installed packages, folders without write access, remains of other runs."""
 
 import os
 import shutil
@@ -26,7 +26,7 @@ ONE = {"returncode": 0, "stdout": "ran\n", "stderr": ""}
 
 
 def environment(**changes):
-    """Return the environment of this process with changes, None for what is to be absent."""
+    """Return the environment of this process with changes; None removes a variable."""
     out = {**os.environ, "PYTHONPATH": str(ROOT), **changes}
     return {name: str(value) for name, value in out.items() if value is not None}
 
@@ -44,13 +44,13 @@ def start(code=SCENE, **changes):
 
 
 def ended(process):
-    """Return what a process has said, when it has ended."""
+    """Return the output of a process after its end."""
     out, err = process.communicate(timeout=120)
     return {"returncode": process.returncode, "stdout": out, "stderr": err}
 
 
 def last_line(code, **changes):
-    """Return what the last line of a failing program says."""
+    """Return the last line of a failing program's output."""
     end = ended(start(code, **changes))
     assert end["returncode"] == 1
     return end["stderr"].splitlines()[-1]
@@ -129,7 +129,7 @@ def test_what_is_wrong_around_one_process_all_of_them_say(tmp_path, monkeypatch)
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """Return a cache in which there is what the scene needs."""
+    """Return a cache with the compiled forms of the scene."""
     cache = tmp_path_factory.mktemp("compiled")
     assert ended(start(XDG_CACHE_HOME=cache)) == ONE, "the compiler's calls are not to be seen"
     return cache

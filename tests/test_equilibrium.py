@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Forces of walls, conditions and tools on the bodies: in balance with loads and weight, and what they are."""
+"""Forces of walls, conditions and tools on the bodies: equilibrium with loads and weight, and exact values."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def weight(s):
 
 
 def off(s, load=0.0, axes=slice(None)):
-    """Return what is left of the sum of all forces on the bodies, over the largest of them."""
+    """Return the resultant of all forces on the bodies, over the largest of them."""
     d, tools = s.grid.dim, s.state.stage.of(mpm.Tool)
     pressed = [s.tool_forces[name][:d] for name in tools]
     forces = [*s.wall_reactions.values(), *s.reactions.values(), *pressed, weight(s)]
@@ -34,7 +34,7 @@ def off(s, load=0.0, axes=slice(None)):
 
 
 def held_and_pressed(water):
-    """Return a block with nearly empty cells beside two walls, with a given side and a rough tool, and its load."""
+    """Return a block with nearly empty cells next to two walls, with a prescribed side and a rough tool; its load."""
     grid = mpm.Grid([0, 0], [2.2, 1.7], [11, 8])
     s = mpm.Simulation(
         grid,
@@ -79,7 +79,7 @@ def a_thin_layer(water):
 
 
 def held_in_the_cells_of_a_wall(water):
-    """Return a block whose held top ends in the cells beside a wall, which it does not touch."""
+    """Return a block whose prescribed top ends in the cells next to a wall, without touching it."""
     grid, walls = mpm.Grid([0, 0], [2.2, 1.7], [11, 8]), {"left": "x", "bottom": "xy"}
     held = mpm.Displacement("top", lambda t: (5e-4 * t, -1e-3 * t))
     body = mpm.box(grid, [0.07, 0], [1.3, 1.1])
@@ -90,7 +90,7 @@ def held_in_the_cells_of_a_wall(water):
 
 
 def pushed_along_a_wall(water):
-    """Return a block, and a plate one cell high, of which a given displacement pushes a side along a rough floor."""
+    """Return a block, and a plate one cell high with a prescribed side, pushed along a rough floor."""
     grid, walls = mpm.Grid([0, 0], [2.2, 1.7], [11, 8]), {"bottom": "xy"}
     bodies = [mpm.box(grid, [0.27, 0], [0.9, 1.1]), mpm.box(grid, [1.3, 0], [1.9, 0.2])]
     near = [((0, 0), (1, 2)), ((1, 0), (2, 2))]

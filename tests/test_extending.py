@@ -14,7 +14,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def load(height):
-    """Return a load on what is as high as that."""
+    """Return a load on points of this height."""
     return mpm.Traction("top", lambda t: (0, -1e6 * min(1, t)), region=((-1, height), (1, height)))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""At the edge of what can be asked results are right or refused, and the demo would notice if they were not."""
+"""Results of extreme input are right or refused, and the demo would notice if they were not."""
 
 from dataclasses import replace
 from itertools import count

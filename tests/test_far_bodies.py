@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What does not touch a body is nothing to it: neither how stiff it is, nor what it does."""
+"""A body is not affected by separate bodies: neither by their stiffness, nor by their motion."""
 
 from functools import cache
 
@@ -44,7 +44,7 @@ def test_what_a_far_body_does_changes_nothing(kind, stiffer):
 
 
 def test_a_plate_is_rigid_beside_what_it_lies_on():
-    """It was beside the stiffest body of the scene: a far one changed its answer, and no step was found."""
+    """Its rigidity was relative to the stiffest body: a far one changed its answer, and no step converged."""
     assert off(after("rests", 1e10, plate=True)[0], after(None, plate=True)[0]) < 1e-11
 
 
@@ -63,7 +63,7 @@ def test_soil_that_yields_takes_the_same_step_whatever_others_do(kind):
 
 @pytest.mark.parametrize("stiffer", [1e6, 1e10, 1e14])
 def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
-    """Rounding is that of each node, and what is told of the residual is that of the soft part too."""
+    """Rounding is estimated at each node, and the reported residual includes the soft part's."""
     grid, load = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), 0.03
     soft, hard = (mpm.Hencky(bulk=f * 1e5, shear=f * 1e5) for f in (1, stiffer))
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
@@ -77,7 +77,7 @@ def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
 
 
 def test_parts_are_the_same_on_several_processes(tmp_path):
-    """A wet beam beside a stiff body that moves and drains, on one process and on three."""
+    """A wet beam next to a stiff body that moves and drains, on one process and on three."""
     for processes in (1, 3):
         mpirun(processes, "mpi_parts.py", str(tmp_path / f"{processes}.npz"))
     one, three = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 3))

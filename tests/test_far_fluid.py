@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body that is far away changes nothing: what is owed to points, and what is sealed, is asked of each part."""
+"""A far body has no effect: volume defects and drainage are determined for each connected part."""
 
 from functools import cache
 
@@ -38,7 +38,7 @@ FAR = {
 
 
 def scene(far=None, load=54e3, wet=True):
-    """Return a beam on whose top a load comes and goes in 1 s, beside a body far away, and the number of its points."""
+    """Return a beam with a load on its top for 1 s, next to a far body, and the number of its points."""
     h = 0.1
     grid = mpm.Grid([0, 0], [2.6, 1.2], [26, 12])
     bodies = [mpm.box(grid, [0, 0.65], [1, 0.95])]
@@ -53,14 +53,14 @@ def scene(far=None, load=54e3, wet=True):
 
 
 def of_beam(s, count):
-    """Return stresses, pressures, places and corners of the beam's points, of which there are so many."""
+    """Return stresses, pressures, positions and corners of the beam's `count` points."""
     p = s.points
     return [values[:count] for values in (s.effective_stress(), p.pressure, p.x, p.corners)]
 
 
 @cache
 def cycled(far=None, load=54e3, wet=True):
-    """Return what a cycle of ten steps leaves of the beam: its change of volume, and `of_beam`."""
+    """Return the beam after a cycle of ten steps: its change of volume, and `of_beam`."""
     s, count = scene(far, load, wet)
     for _ in range(10):
         s.step(0.1)

@@ -19,7 +19,7 @@ NAMES = {"argvalues": SIZES.values(), "ids": SIZES}
 def block(origin, size, walls, **options):
     """Return a simulation of a block, half as high as wide and pressed on a part of its top, and probes on it.
 
-    There is room beside it, but where a wall holds it.
+    The grid extends beyond it, except at the wall that fixes it.
     """
     lower = np.array([origin, 0.9 * origin])
     room = [[side not in walls for side in sides] for sides in (("left", "bottom"), ("right", "top"))]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A fill is put onto the present surface of what it was seeded to touch, with no gap and no overlap, at rest."""
+"""A fill is placed on the present surface of its seeded neighbours, without gap or overlap, at rest."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The fluid counted from the points: porosity times density times volume, less what they are owed, is what came."""
+"""The fluid counted from the points, porosity times density times volume less the defect, equals the inflow."""
 
 import numpy as np
 import pytest
@@ -54,9 +54,10 @@ OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.
     ids=["sealed", "compressible", "axisymmetric", "3D", "open", "fed"],
 )
 def test_yielding_soil_keeps_its_fluid(scene):
-    """Soil that had yielded was owed nothing: 3 % of what was exchanged in it got lost, 2 % with deep footings.
+    """Yielded soil had no volume defect before: 3 % of the exchanged fluid was lost, 2 % with deep footings.
 
-    Pressures of points are means over their domains, cells store by porosity: this is what compressible fluid is off.
+    Pressures of points are means over their domains, cells store by porosity: this causes the error of compressible
+    fluid.
     """
     s, steps = footing(**scene), 5
     start, came = fluid_of(s)[0], 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A footing pushed into soil: it carries what limit analysis says, and the domains that it folds stay with it."""
+"""A footing pushed into soil: it carries the load of limit analysis, and inverted domains stay with it."""
 
 from dataclasses import replace
 
@@ -137,7 +137,7 @@ def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
 
 @pytest.mark.slow
 def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
-    """From 0.37 widths on it was a sixth too much: the wall beside it, over its base by a hair, drained that soil."""
+    """From 0.37 widths on it was a sixth too much: the wall next to it, just above its base, drained that soil."""
     run = footing.push(footing.SOIL, 9, 0.5, footing.RATES["fast"], box=(4.0, 2.5), steps=126)
     depth = np.array(run.settlement)
     for low, high, error in ((0.08, 0.3, 0.04), (0.3, 0.5, 0.05)):  # below 0.08 widths not all of the soil flows

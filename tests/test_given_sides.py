@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Given displacements: on curved and slanted sides, beside walls and each other, and what is said where they fail."""
+"""Prescribed displacements: curved and slanted sides, neighbouring walls and sides, and messages of failure."""
 
 import sys
 from dataclasses import replace
@@ -124,7 +124,7 @@ def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
 
 
 def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_line_and_while_it_is_held():
-    """It carried from 1 to 1.9 times as much: the wall's nodes bear what is counted, and bend what is asked."""
+    """It carried from 1 to 1.9 times as much: wall nodes bear the counted force, and bend the prescribed field."""
     ways, lines = [(0.001, 1), (0.1, 4), (0.5, 1), (0.5, 10)], (0.5, 0.55, 0.575)
     loads = np.array([[pushed_along_a_rough_base(*way, line) for way in ways] for line in lines])
     print(f"rows: lines, columns: (ways over h, steps)\nat the end\n{loads[..., 0]}\nheld\n{loads[..., 1]}")
@@ -214,7 +214,7 @@ def footing_load(width):
 
 
 def test_a_held_region_may_end_anywhere_in_domains_and_cells():
-    """Lines of the points that lie on those of the grid, and that do not."""
+    """Lines of the points on the grid's lines, and off them."""
     loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
     print(f"22/9, 2.40, 2.46 wide: load / c down {loads[:, 1]}, sideways {loads[:, 0]}")
     assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)

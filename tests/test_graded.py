@@ -55,9 +55,9 @@ def test_where_nothing_changes_it_is_the_mean():
     "per_cell, steps, ceilings", [(1, 40, (3e-3, 2e-3)), (2, 40, (3e-3, 2e-3)), (2, 200, (5e-3, 3e-3, 1e-3))]
 )
 def test_a_column_that_shrinks_to_half_with_a_conductivity_law_settles_in_its_time(per_cell, steps, ceilings):
-    """Hencky, k = k0 J^3 / (1 - ln J): its top conducts a tenth of what it did, within few cells.
+    """Hencky, k = k0 J^3 / (1 - ln J): the top conducts a tenth of its initial value, within few cells.
 
-    At T = 0.05, 0.1 and 0.5, in equal steps to the last of them that has a ceiling.
+    At T = 0.05, 0.1 and 0.5, in equal steps to the last time with a ceiling.
     """
     h, soil = 1 / 50, mpm.Hencky(1e6 / 3, 5e5, porosity=0.7, conductivity=1e-4, conductivity_law=linear_diffusion)
     grid = mpm.Grid([0, 0], [h, 1.0], [1, 50])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Inertia: what moves goes on moving, and keeps its momentum, wherever the grid's lines are."""
+"""Inertia: a moving body continues to move, and keeps its momentum, at any position of the grid's lines."""
 
 import numpy as np
 import pytest
@@ -280,8 +280,8 @@ def test_a_saturated_column_shakes_as_the_exact_one():
 def test_water_that_flows_freely_does_not_make_a_column_unstable():
     """Exact settlement of a half-space of hard water and grains, u-p (after de Boer, Ehlers and Liu 1993), at 0.05 s.
 
-    With the face's acceleration alone in the flux pressures grew from step to step: water, 1000 kg/m^3, then has more
-    mass in what alternates between nodes than a third of the mixture, 1670 kg/m^3.
+    With the face's acceleration alone in the flux, pressures grew from step to step. Water, 1000 kg/m^3, then has more
+    mass in alternating nodal modes than a third of the mixture, 1670 kg/m^3.
     """
     soil = mpm.LinearElastic(
         bulk=14.515e6 / 1.2, shear=14.515e6 / 2.6, porosity=0.33, grain_density=2000.0, conductivity=1e-2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What laws with local unknowns cost: a step beside Drucker and Prager's law, and their forms in 3D."""
+"""Costs of laws with local unknowns: a step compared with Drucker and Prager's law, and their forms in 3D."""
 
 import os
 import resource

@@ -49,7 +49,7 @@ def ends(dim, pressure=TINY):
 
 
 def outflow(simulation):
-    """Return what flows out of the open sides at the end of the last step, m^d/s."""
+    """Return the outflow through the open sides at the end of the last step, m^d/s."""
     return simulation.outflows.array.clip(min=0).sum()
 
 

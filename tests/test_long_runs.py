@@ -25,14 +25,14 @@ def cycle(h, cycles, material=SOFT, observe=(), **options):
 
 
 def returned(result):
-    """Return what is left of the deflection after each cycle, relative to the largest."""
+    """Return the residual deflection after each cycle, relative to the largest."""
     tip = np.array(result.displacement)[:, 0, 1]
     return np.abs(tip[STEPS::STEPS]) / np.abs(tip).max()
 
 
 @pytest.mark.slow
 def test_a_beam_comes_back_after_2000_steps():
-    """0.17 % with h = 0.015 m, 0.65 % with 0.03 m: what is left grows by the same in each cycle, and falls as h^2."""
+    """0.17 % with h = 0.015 m, 0.65 % with 0.03 m: the residual grows equally in each cycle, and falls as h^2."""
     s, result = cycle(0.02, 50)
     assert result.steps == 2000 and returned(result)[-1] < 5e-3
     assert (s.points.volume0 * s.points.J).sum() == pytest.approx(0.3, rel=1e-4)
@@ -52,9 +52,9 @@ def test_what_is_left_of_a_cycle_falls_with_the_cell_size():
     ],
 )
 def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, bulk, cycles, most):
-    """Corners follow more than the Q1 field, by 7e-5 of the volume in a cycle: what they gain is paid back.
+    """Corners follow more than the Q1 field, by 7e-5 of the volume in a cycle: the volume defect is corrected.
 
-    What is left, the gain of the last step, does not grow.
+    The remainder, the gain of the last step, does not grow.
     """
     volumes = []
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cells of many sizes, between lines at random: what holds in equal cells holds there, and equal lines are these."""
+"""Cells of many sizes, between random lines: they share the properties of equal cells, and their limit is these."""
 
 import footing
 import manufactured as made
@@ -18,7 +18,7 @@ EXACT = mpm.Numerics(tolerance=1e-12)
 
 
 def at_random(low, high, cells, seed=0, ratio=3.0):
-    """Return lines of which neighbouring cells are up to three times as wide."""
+    """Return lines with neighbouring cells of up to three times the width."""
     rng = np.random.default_rng(seed)
     out = []
     for a, b, n in zip(low, high, cells, strict=True):
@@ -91,7 +91,7 @@ def test_points_and_nodes_are_found_and_shape_functions_are_exact_for_linear_fie
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_domains_are_cut_exactly(dim, axisymmetric):
-    """Volumes, centroids and what lies on faces between cells, from both sides."""
+    """Volumes, centroids and areas on faces between cells, from both sides."""
     grid, rng = uneven(dim, axisymmetric), np.random.default_rng(3)
     F = np.eye(dim) + 0.3 * rng.normal(size=(100, dim, dim))
     corners = rng.uniform(0.4, 0.9, (100, 1, dim)) + np.einsum("nab,kb->nka", 0.2 * F, corner_bits(dim) - 0.5)
@@ -196,7 +196,7 @@ def layers(grid):
 
 
 def yielding(grid, **soil):
-    """Return soil into which a side is pushed, beside its drained top."""
+    """Return soil with a side pushed in, next to its drained top."""
     soil = mpm.DruckerPrager(1e6, 4e5, porosity=0.4, conductivity=1e-5, cohesion=1e3, friction=20.0, dilation=5.0)
     push = mpm.Displacement("top", lambda t: (0, -0.02 * t), region=([0, 0.7], [0.35, 0.9]))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
@@ -205,7 +205,7 @@ def yielding(grid, **soil):
 
 
 def softening(grid):
-    """Return soil of which each cell softens by its own size."""
+    """Return soil that softens in each cell by the cell's size."""
     soil = mpm.SofteningDruckerPrager(
         1e6, 4e5, cohesion=1e3, friction=0.0, dilation=0.0, residual=500.0, slip=0.05, viscosity=10.0
     )
@@ -258,7 +258,7 @@ SCENES += [(draining, 1e3), (of_points, 1.0)]
     "make, end", [pytest.param(*s, marks=[] if s[0] in (beam, touched) else [pytest.mark.slow]) for s in SCENES]
 )
 def test_lines_that_are_nearly_equal_show_what_equal_cells_do(make, end):
-    """All terms of the code for cells of many sizes are met beside those of equal ones."""
+    """This compares all terms of the code for cells of many sizes with the code for equal cells."""
     ends = []
     for grid in nearly_equal([0, 0], [1.2, 1.2], [12, 12]):
         s = make(grid)
@@ -382,7 +382,7 @@ def test_a_footing_in_a_large_box_of_graded_cells_carries_what_it_does_in_a_smal
 
 @pytest.mark.slow
 def test_a_body_that_is_carried_through_graded_lines_and_back_is_as_one_in_equal_cells():
-    """A wet beam, clamped to what moves it by its length and bent on its way: stress and pressure that are left."""
+    """A wet beam, clamped to a support that moves by its length, and bent on its way: residual stress and pressure."""
     left, h = [], 0.05
     lines = mpm.graded([-0.2, 0], [2.6, 1.2], [[[-0.2, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
     for grid in (mpm.Grid([-0.2, 0], [2.6, 1.2], [56, 24]), mpm.Grid(lines=lines)):

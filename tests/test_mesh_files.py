@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of meshes: what they say is where they say it, or it is refused in one line."""
+"""Mesh files: elements and sides are where the file has them, or the file is refused in one line."""
 
 import struct
 
@@ -328,7 +328,7 @@ def test_a_bad_file_is_refused_in_one_line(made, name, value, tmp_path):
 
 
 def test_wedges_meet_tetrahedra_and_hexahedra_face_to_face():
-    """Three unit cubes in an L: on a wedge's triangles stand tetrahedra, beside its quadrilaterals a hexahedron."""
+    """Three unit cubes in an L: tetrahedra on a wedge's triangles, and a hexahedron next to its quadrilaterals."""
     wedges, tops, cube = (box_mesh(k, (1,) * 3, low, np.add(low, 1)) for k, low in (
         ("wedge", (0, 0, 0)), ("tetra", (0, 0, 1)), ("hexahedron", (1, 0, 0))))  # fmt: skip
     x, at = np.unique(np.concatenate([m.points for m in (wedges, tops, cube)]), axis=0, return_inverse=True)

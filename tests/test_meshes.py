@@ -126,7 +126,7 @@ def test_a_beam_of_a_mesh_in_3d_bends_as_one_of_boxes():
 
 
 def cylinder(p, bulk, shear):
-    """Return what gives u, sigma_r, sigma_t at radii R of a cylinder from 1 to 2 m, Hencky's law, with p inside."""
+    """Return a function for u, sigma_r, sigma_t at radii R of a cylinder, 1 to 2 m, Hencky's law, with p inside."""
 
     def stresses(R, r, slope):
         strain = np.array([np.log(slope), np.log(r / R), 0 * R])
@@ -281,7 +281,7 @@ def test_cells_may_be_numbered_either_way_round(kind):
 
 @pytest.mark.parametrize("kind", ["triangle", "quad", "tetra", "hexahedron", "wedge"])
 def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_overlap(kind):
-    """No two cells share a facet there, and all of them lie on both sides of those that they share."""
+    """Overlapping cells share no facet there, and all shared facets have a cell on either side."""
     dim = len(ALL[kind])
     grid = mpm.Grid([0] * dim, [4, 4, 1][:dim], [8, 8, 2][:dim])
 
@@ -299,7 +299,7 @@ def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_ove
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
-    """Meshes of random points, of which one is moved, or some cells are left out, or two that are put anywhere."""
+    """Meshes of random points, with one point moved, or some cells left out, or two added anywhere."""
     rng, grid, taken = np.random.default_rng(dim), mpm.Grid([0] * dim, [1.0] * dim, [1] * dim), {True: 0, False: 0}
     for trial in range(30):
         x = rng.random((rng.integers(dim + 3, 20), dim))

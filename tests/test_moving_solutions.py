@@ -61,10 +61,10 @@ def swinging_apart(n, t_end, amplitude=0.05):
 
 
 def vortex(n, t_end, amplitude):
-    """Return the error of positions, over the amplitude, in a ring that turns in itself and back within a second.
+    """Return the error of positions, over the amplitude, in a ring that rotates and returns within a second.
 
     theta = Theta + G(t) h(R), G = A/2 (1 - cos(2 pi t)), h = 1 - 32 (R - 1)^2 + 256 (R - 1)^4 from R = 0.75 to 1.25 m;
-    what lies beyond rests.  Kamojjala, Brannon, Sadeghirad and Guilkey (2015).
+    the material beyond is at rest. Kamojjala, Brannon, Sadeghirad and Guilkey (2015).
     """
     w = 2 * np.pi
 

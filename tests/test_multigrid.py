@@ -67,7 +67,7 @@ def test_finer_grids_take_no_more_iterations():
 
 
 def layers(X, below: float, above: float):
-    """Return values of a lower layer, a third of the body, and of what is above it."""
+    """Return values of a lower layer, a third of the body, and of the upper part."""
     return np.where(X[:, 1] < 0.1, below, above)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What docstrings and comments name is there, and where they say that it is."""
+"""Names in docstrings and comments exist, at the place that is given."""
 
 import ast
 import importlib
@@ -25,7 +25,7 @@ def module_of(file: Path) -> ModuleType:
 
 
 def words(tree: ast.AST) -> set[str]:
-    """Return all names that a file has: of what it defines, takes, sets, asks for, and short texts such as keys."""
+    """Return all names in a file: definitions, parameters, attributes, keywords, and short texts such as keys."""
     out = set()
     for node in ast.walk(tree):
         for kind, name in ((ast.Name, "id"), (ast.Attribute, "attr"), (ast.arg, "arg"), (ast.keyword, "arg")):
@@ -84,7 +84,7 @@ def stale(file: Path, name: str) -> bool:
 
 
 def test_names_in_backticks_are_there():
-    """Seven were those of what had been renamed or had moved."""
+    """Seven belonged to renamed or moved objects."""
     found = [(f, name) for f, text in TEXTS.items() for name in NAME.findall(text) if stale(f, name)]
     assert not found, "\n".join(f"{file.relative_to(ROOT)}: {name}" for file, name in found)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Newton's method: steps that explode are shortened; what is above round-off is solved for, however little it is."""
+"""Newton's method: exploding steps are shortened; residuals above round-off are solved for, however small."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ SIDES = {"left": "x", "right": "x"}
 
 @dataclass(frozen=True)
 class Stiffening(mpm.Skeleton):
-    """Linear in all components of F - I but the last, along y, of which the stress is soft e exp(exponent e^2)."""
+    """Linear in all components of F - I but the last, along y, whose stress is soft e exp(exponent e^2)."""
 
     soft: mpm.Field = 1.0
     exponent: mpm.Field = 1.0
@@ -31,10 +31,10 @@ class Stiffening(mpm.Skeleton):
 
 @pytest.mark.parametrize(("exponent", "shortened"), [(8, False), (14, True)])
 def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thousandfold(exponent, shortened):
-    """A body under tension across is pulled upward 1e5 times less, as it lets go of: along y its tangent is that soft.
+    """A body under tension across is pulled upward by 1e5 times less on release: its tangent along y is that soft.
 
-    The first step overshoots to e = 1, where the residual is 3e3 or 1e6 times what it was.  From there Newton's method
-    comes back in about as many iterations as the exponent, and some.
+    The first step overshoots to e = 1, where the residual is 3e3 or 1e6 times its initial value. From there Newton's
+    method returns in a few more iterations than the exponent.
     """
     grid, across = mpm.Grid([0, 0], [1.2, 1.5], [12, 15]), 1e5
     pulls = [mpm.Traction("right", (across, 0)), mpm.Traction("top", lambda t: (0, float(t > 1)))]
@@ -65,7 +65,7 @@ def stretch(load):
 
 @pytest.mark.parametrize(("stiffer", "load", "error"), [(1e7, 0.01, 1e-4), (1e8, 0.03, 1e-5)])
 def test_what_round_off_in_a_stiff_part_does_not_hide_is_solved_for(stiffer, load, error):
-    """What Newton's first step leaves of the soft part's residual is 100 times the round-off of the stiff part."""
+    """After Newton's first step the soft part's residual is 100 times the round-off of the stiff part."""
     grid = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
     hard = mpm.Hencky(bulk=stiffer * SOIL.bulk, shear=stiffer * SOIL.shear)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Laws along paths that cycle and turn: what an observer who turns sees."""
+"""Laws along paths that cycle and rotate: a rotating observer sees rotated stresses."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run leaves on the disk and on the terminal."""
+"""Output of a run on the disk and on the terminal."""
 
 import csv
 import importlib
@@ -29,7 +29,7 @@ from mpm_dolfinx.points.cutting import volumes
 
 
 def with_h5py():
-    """Skip where no h5py can be loaded beside dolfinx, such as PyPI's with an HDF5 of its own."""
+    """Skip without an h5py that works with dolfinx; PyPI's has its own HDF5."""
     try:
         importlib.import_module("h5py")
     except Exception as error:
@@ -389,7 +389,7 @@ def test_points_are_shown_in_one_line_of_numbers():
 
 
 def test_tools_are_written_where_they_are(tmp_path):
-    """A disc that goes down, and a plate beside the grid, of which nothing is to be seen."""
+    """A disc that goes down, and a plate outside of the grid, which is not visible."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [8, 8])
     disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conditions of a user's own, outside of the package: objects that have the methods of what acts on a balance."""
+"""User-defined conditions outside of the package: objects with the methods of loads or fluid conditions."""
 
 from dataclasses import dataclass
 
@@ -148,7 +148,7 @@ class SkinFeeds(mpm.Feeds):
 
 @pytest.mark.parametrize("conductance", [1e-9, 1e-6])
 def test_a_skin_of_the_users_own_on_a_side_resists_the_flow_through_it(conductance):
-    """What flows is that through body and skin one after the other, p A / (L / kappa + 1 / conductance)."""
+    """Body and skin are in series: the flow is p A / (L / kappa + 1 / conductance)."""
     ends = [mpm.Drained("bottom", 1e4), Skin("top", conductance)]
     s = block(conditions=[mpm.Displacement("bottom", (0, 0)), *ends], fluid=mpm.Fluid())
     s.run(1e4, 1e3, progress=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where points are: at the centroids of their domains, of which all that they carry is told."""
+"""Positions of points: centroids of their domains, at which all of their data are evaluated."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stresses across the plane, their invariants, and what is recorded of probes, against exact ones."""
+"""Out-of-plane stresses, their invariants, and records of probes, compared with exact ones."""
 
 import csv
 import re

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is told of the points' pressures: exact where they are linear, means kept, nothing that is not there."""
+"""Reported pressures of points: exact for linear fields, means are kept, and no new extremes."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pressures and stresses of probes are those of their places: exact where linear, of second order elsewhere."""
+"""Pressures and stresses of probes at their positions: exact for linear fields, else of second order."""
 
 from dataclasses import replace
 
@@ -137,7 +137,7 @@ def stressed(grid, bodies, materials, field):
 
 @pytest.mark.parametrize("dim, axisymmetric", [(2, False), (2, True), (3, False)], ids=["plane", "ring", "space"])
 def test_a_linear_stress_is_exact_at_any_place_of_irregular_domains(dim, axisymmetric):
-    """Up to sides, edges and corners, and beside other materials and bodies."""
+    """Up to sides, edges and corners, and next to other materials and bodies."""
     grid = mpm.Grid([0] * dim, [2.0] * dim, [5 if dim == 2 else 4] * dim, axisymmetric=axisymmetric)
     boxes = [mpm.box(grid, [a] + [0.0] * (dim - 1), [b] + [1.0] * (dim - 1), material=m) for a, b, m in PARTS]
     bodies = [mpm.mapped(grid, boxes[0], irregular), *boxes[1:]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What users write: exported types, one list of conditions, functions by the names of their parameters."""
+"""The user's interface: exported types, one list of conditions, functions by the names of their parameters."""
 
 import ast
 import inspect

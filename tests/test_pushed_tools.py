@@ -152,7 +152,7 @@ def test_a_load_comes_all_at_once_and_of_any_length_of_its_direction():
 
 @pytest.mark.parametrize("x", [1.0, 0.5])
 def test_a_rough_ball_begins_to_press_a_layer(x):
-    """The shear of what sticks pushed the surface away from it, in turns with no shear at all."""
+    """The shear of sticking cells pushed the surface away from it, alternating with no shear at all."""
     ball = mpm.Ball((x, 1.15), 0.15)
     for load in (50.0, 1e3):
         s = layer(pushed(lambda t, load=load: load * t, ball, friction=0.3))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What users' functions raise or give, wrong indices, files and contradictions get one line, and nothing is lost."""
+"""Errors and values of users' functions, wrong indices, files and contradictions give one line; nothing is lost."""
 
 import resource
 import signal

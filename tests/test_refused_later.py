@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is wrong with fields of a stage, numbers in forms, checkpoints and observers is said where it is given."""
+"""Invalid fields of a stage, numbers in forms, checkpoints and observers are refused where they are given."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pressure's remap changes nothing at rest, loses nothing in motion, and is exact for what is linear."""
+"""The pressure's remap changes nothing at rest, loses nothing in motion, and is exact for linear fields."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def moved(s, state, pressure, way):
 
 
 def moving_body(move, pressure, slope, bounds):
-    """Return what pieces of a rigid body carry, how they lie after a move (in cells), and the move (m)."""
+    """Return the pieces' data of a rigid body, their positions after a move (in cells), and the move (m)."""
     grid = mpm.Grid([0, 0], [2.0, 2.0], [20, 20])
     points = material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
     old, way = cut(grid, points.corners), move * grid.h * [0.8, 1.0]
@@ -101,7 +101,7 @@ def test_a_linear_pressure_moves_with_the_body(move):
 
 
 def reconstruct(p, filled=None):
-    """Return (midpoints, slopes, bounds) of cells with values p(x), all full, or those where `filled(x)`."""
+    """Return (midpoints, slopes, bounds) of cells with values p(x), all full, or only where `filled(x)`."""
     grid = mpm.Grid([0, 0], [1.0, 0.5], [10, 5])
     faces = np.ones((grid.num_local, 2, 2))
     if filled is not None:

@@ -104,7 +104,7 @@ def test_a_plate_bends_nothing_at_rest(bend):
 
 
 def test_curved_sides_that_are_held_are_at_rest():
-    """Their wet points have the pressures of their centroids from the start: else what holds would feel the change."""
+    """Their wet points have the pressures of their centroids from the start: else supports would feel the change."""
     grid = mpm.Grid([0, -1], [2, 3], [8, 16])
     body = mpm.mapped(
         grid,
@@ -128,7 +128,7 @@ def test_curved_sides_that_are_held_are_at_rest():
 
 
 def test_half_a_base_bears_all_and_what_then_loses_its_support_sinks_or_is_refused():
-    """No force but those that the scene names holds soil once a stage begins."""
+    """Only forces of the scene's conditions hold soil once a stage begins."""
     half = ([-1, -1], [1, 1])
     rests(soil(between=False, lower=0.13, given=[hold("bottom", region=half)]))
     s = soil(between=False, lower=0.13, given=[hold("bottom")])

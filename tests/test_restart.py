@@ -88,7 +88,7 @@ def same(one, other):
 
 
 def every_step(folder):
-    """Return what saves every step in a file of its own, the first as 2."""
+    """Return an observer that saves every step in a separate file, the first as 2."""
     return lambda s: restart.save(s, folder / f"{len(s.result.t)}")
 
 
@@ -161,7 +161,7 @@ def readable(folder):
 
 @pytest.fixture(scope="module")
 def parallel(tmp_path_factory):
-    """Return the beam run by one process, and the folder of what `mpi_restart.py` leaves on two."""
+    """Return the beam run by one process, and the output folder of `mpi_restart.py` on two."""
     folder = tmp_path_factory.mktemp("parallel")
     one, probe = beam(h=0.06)
     half, end, dt = mpi_restart.T_END / 2, mpi_restart.T_END, mpi_restart.DT

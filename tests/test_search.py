@@ -22,7 +22,7 @@ def test_a_step_of_what_does_not_yield_is_halved_where_the_residual_explodes_or_
 
 
 def pushed(dim: int = 2) -> mpm.Simulation:
-    """Return soft ground, of which a given displacement pushes half of the top, beyond its limit load."""
+    """Return soft ground; a prescribed displacement pushes half of its top beyond the limit load."""
     n, free = 6, [np.inf] * (dim - 1)
     grid = mpm.Grid([0] * dim, [1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + 2])
     soil = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
@@ -56,7 +56,7 @@ def test_the_second_substep_begins_as_the_first_went_on_where_soil_flows(monkeyp
 
 
 def test_a_direction_that_leads_backwards_is_turned_round(monkeypatch):
-    """As those of tangents with less than no stiffness; turned by the linear solver they change no bit."""
+    """As for tangents with negative stiffness; the linear solver's reversal changes no bit."""
     s = pushed()
     s.run(2, 1)
     before, forwards = s.state, s.step(1.0)

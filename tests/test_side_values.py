@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What acts on sides as functions of time and place: loads, heads and inflows."""
+"""Side conditions as functions of time and position: loads, heads and inflows."""
 
 from functools import partial
 

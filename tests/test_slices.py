@@ -35,12 +35,12 @@ def scene(across, make):
 
 
 def beam(soil, **options):
-    """Return what makes a clamped beam that is bent."""
+    """Return a function that makes a clamped beam in bending."""
     return lambda place: ((0, 0.03), (0.5, 0.27), soil, {"left": "xz"}, -6e3, options)
 
 
 def ground(soil, **options):
-    """Return what makes ground with a stress at rest that is loaded."""
+    """Return a function that makes loaded ground with an initial stress."""
 
     def make(place):
         weighs = {"gravity": place(0, -10.0), "initial_stress": mpm.K0(0.6, surcharge=2e3)}

@@ -70,7 +70,7 @@ def test_a_bank_that_softens_slides_as_far_on_cells_half_as_large():
 
 @dataclass(frozen=True)
 class Maxwell(mpm.Skeleton):
-    """Volume strain of which a part relaxes: ln J = e + k, k' = e / relaxation, pressure K e; elastic in shear."""
+    """Volume strain with a relaxing part: ln J = e + k, k' = e / relaxation, pressure K e; elastic in shear."""
 
     relaxation: mpm.Field = 1.0
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Factors in blocks solve what they are given."""
+"""Block factors solve their systems."""
 
 import gc
 import weakref
@@ -70,7 +70,7 @@ def test_nested_dissection_orders_nodes_of_any_shape_and_lines_come_after_both_s
 
 
 def test_factors_by_nested_dissection_fill_little():
-    """Those of n x n nodes at most 31/4 n^2 log2 n, with nine neighbours two thirds of it: here 0.44 and 0.56."""
+    """For n x n nodes at most 31/4 n^2 log2 n, with nine neighbours two thirds of it: here 0.44 and 0.56."""
     for n in (20, 80):
         i = np.arange(n * n)
         x = np.stack([i % n, i // n], axis=1).astype(float)
@@ -101,7 +101,7 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
 
 
 def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
-    """Return a saturated cube, of which a given displacement, `step` (m) a second, pushes a quarter of the top."""
+    """Return a saturated cube; a prescribed displacement, `step` (m) a second, pushes a quarter of the top."""
     air = n // 4
     grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1 + air / n], [n, n, n + air])
     walls = dict.fromkeys(("left", "right"), "x") | dict.fromkeys(("front", "back"), "y") | {"bottom": "xyz"}
@@ -112,7 +112,7 @@ def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
 
 
 def pushed(bulk: float) -> list[Report]:
-    """Return what two steps of such a cube take."""
+    """Return the iterations of two steps of such a cube."""
     s = quarter_pushed(mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7), 8, 0.01)
     return [s.step(1.0), s.step(1.0)]
 
@@ -167,7 +167,7 @@ def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many
 
 
 def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatch):
-    """They are those of the tangent before, the matrix is the present one."""
+    """The factors belong to the previous tangent, the matrix is the present one."""
     few = pushed(500e6)[0]
     thresholds(monkeypatch, fallback_3d=0)
     many = pushed(500e6)[0]
@@ -196,7 +196,7 @@ def test_water_flows_through_a_body_whose_nodes_are_all_held():
 
 
 def strip_pushed() -> mpm.Simulation:
-    """Return saturated soil, of which a given displacement, 0.01 m a second, pushes half of the top."""
+    """Return saturated soil; a prescribed displacement, 0.01 m a second, pushes half of the top."""
     grid, half = mpm.Grid([0, 0], [1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
     walls, drained = (
         {"left": "x", "right": "x", "bottom": "xy"},
@@ -222,7 +222,7 @@ def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):
 
 @pytest.mark.parametrize("solvers", ["factors", "multigrid in 2D", "multigrid in 3D"])
 def test_solvers_go_with_their_step_without_the_help_of_pythons_collector(solvers, monkeypatch):
-    """Their factors are most of what a large body takes."""
+    """Their factors use most of a large body's memory."""
     made, make = weakref.WeakSet(), schur.LinearSolvers.__init__
     monkeypatch.setattr(schur.LinearSolvers, "__init__", lambda self, *a: made.add(self) or make(self, *a))
     thresholds(monkeypatch, multigrid_2d=1 if solvers == "multigrid in 2D" else THRESHOLDS.multigrid_2d)

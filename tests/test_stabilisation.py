@@ -147,7 +147,7 @@ def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):
 
 
 def test_what_damps_soft_soil_meets_no_even_gradient_and_loses_no_fluid():
-    """Cells that alternate along both axes meet what a damping of jumps gives them, away from the sides."""
+    """Cells that alternate along both axes are damped as by a damping of jumps, away from the sides."""
     grid = mpm.Grid([0, 0], [6.0, 4.0], [6, 4])
     cells, index, rng = np.arange(grid.num_local), grid.index_from_base(grid.midpoints), np.random.default_rng(0)
     own, opening = Unknowns(fem.Function(grid.cellwise()), cells), np.ones((grid.num_local, 2, 2))

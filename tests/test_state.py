@@ -207,7 +207,7 @@ TestDriven.settings = settings(
 
 
 def interrupted_runs(count):
-    """Return the state of a run that was left alone, and those of runs that were interrupted once and went on."""
+    """Return the state of an uninterrupted run, and states of runs that were interrupted once and continued."""
     s, probe = beam(h=0.1, offset=0.3)
     s.run(0.1, 0.02, probes=probe, progress=False)
     states, moments = [], np.random.default_rng(0).integers(0, 9000, count)

@@ -43,7 +43,7 @@ def ellipse(x, values, half):
 
 @pytest.mark.slow
 def test_a_disc_that_is_pulled_sticks_where_cattaneo_and_mindlin_say():
-    """What shear lacks of mu p is an ellipse over the stick zone; 16 cells over the half-width."""
+    """The difference of mu p and shear is an ellipse over the stick zone; 16 cells over the half-width."""
     for pull, x, most, q in pulled(16, 6.0, 3, 1):
         exact = np.sqrt(1 - pull)
         half = ellipse(x, most, 1.0)

@@ -14,7 +14,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 
 def residual(s, pressure, dt=1.0):
-    """Return the storage's residual at rest, the cells' pressures those that `pressure` gives for their heights."""
+    """Return the storage's residual at rest, with cell pressures `pressure` of their heights."""
     storage, forms = set_up(s, dt).storage, s.scene.storage
     y = (s.grid.midpoints + s.scene.last[0].contents.centroid)[:, 1]
     forms.p.x.array[:] = forms.p_n.x.array[:] = pressure(y)
@@ -120,10 +120,11 @@ def test_pressure_jumps_are_damped_only_where_next_to_nothing_flows():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabilisation(dim):
-    """S dp V = Q dt - tau h A [dp] where fluid comes into one of them and none flows; the skeleton sees the sum of dp.
+    """S dp V = Q dt - tau h A [dp] for an inflow into one of two cells, without flow between; the skeleton feels the
+    sum.
 
-    Published: 3 alpha^2 / (8 (lambda + 3G)) in 2D, for a patch of four cells; in 3D it is the same, for pressures that
-    alternate along two axes are those of plane strain.
+    Published: 3 alpha^2 / (8 (lambda + 3G)) in 2D, for a patch of four cells. It is the same in 3D: pressures that
+    alternate along two axes are a plane strain problem.
     """
     lam, shear, biot, brought = 2e6, 5e6, 0.8, 1e-6  # the last: share of a cell's volume
     soil = mpm.Hencky(bulk=lam + 2 * shear / 3, shear=shear, porosity=0.4, biot=biot)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The factor of safety: exact for a block, limit analysis and published values for slopes; what is refused."""
+"""The factor of safety: exact for a block, limit analysis and published values for slopes; refusals."""
 
 import io
 import logging
@@ -21,7 +21,7 @@ CONE = mpm.DruckerPrager(bulk=2e8, shear=1e8, friction=PHI, dilation=PHI, cohesi
 
 
 def strength(factor):
-    """Return what a block in plane strain carries with its strength over a factor, Pa."""
+    """Return the load of a block in plane strain with its strength over a factor, Pa."""
     return 2 * C / factor * np.tan(np.pi / 4 + np.arctan(np.tan(np.radians(PHI)) / factor) / 2)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The package has no hidden state and no circle: what is made is complete, and only the state is replaced."""
+"""The package has neither hidden state nor cycles: objects are complete, and only the state is replaced."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -14,7 +14,7 @@ TREES = {path: ast.parse(path.read_text()) for path in ROOT.rglob("*.py")}
 
 
 def assigned(tree):
-    """Yield (class, method, attribute) of what methods set on their own object."""
+    """Yield (class, method, attribute) of the attributes that methods set on their own object."""
     for cls in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
         for method in (node for node in cls.body if isinstance(node, ast.FunctionDef)):
             for node in ast.walk(method):

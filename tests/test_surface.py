@@ -15,7 +15,7 @@ SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 
 @st.composite
 def stacks(draw, dim):
-    """Return a box, and up to three boxes beside one another on it, with spacings and offsets of their own."""
+    """Return a box with up to three boxes side by side on it, with spacings and offsets of their own."""
     grid = mpm.Grid([0] * dim, [4.0] * dim, [4] * dim)
 
     def box(low, high):

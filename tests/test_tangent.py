@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tangent of a scene as matrices: what the residuals change by."""
+"""The tangent of a scene as matrices: derivatives of the residuals."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def block(fluid: bool, dim: int = 2, law: type[mpm.Skeleton] = mpm.Hencky, **opt
 
 @pytest.mark.parametrize("fluid", [False, True], ids=["dry", "wet"])
 def test_products_of_the_tangent_are_what_residuals_change_by(fluid):
-    """In a short step: what fluxes gain by displacements is left out."""
+    """In a short step: the derivative of fluxes by displacements is left out."""
     s, rng, dt = block(fluid), np.random.default_rng(2), 1e-4
     found = s.tangent(dt)
     _, momentum, storage = set_up(s, dt)

@@ -35,7 +35,7 @@ def test_a_block_sheared_by_500_percent_keeps_volume_and_stress():
 
 
 def test_a_block_sheared_between_plates_goes_on_where_domains_have_folded(monkeypatch):
-    """None folds of itself: those whose corners span a little less than their volume are taken for folded."""
+    """No domain is really inverted: corners that span a little less than their volume are taken for it."""
     monkeypatch.setattr("mpm_dolfinx.points.cutting.TANGLED", 0.8)
     s, result = sheared(("bottom", "top"), gamma=8.0, steps=160)
     assert result.converged and result.residual <= 1e-8

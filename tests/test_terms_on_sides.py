@@ -24,7 +24,7 @@ def robin(points, u, v):
 
 
 def column(terms, dim=2, off=0.03, load=LOAD, **options):
-    """Return a column between smooth walls, afloat but for what the terms are, its base off the grid lines."""
+    """Return a column between smooth walls, supported by the terms alone, its base off the grid lines."""
     grid = mpm.Grid([0] * dim, [0.5] * (dim - 1) + [1.5], [2] * (dim - 1) + [6])
     body = mpm.box(grid, [0] * (dim - 1) + [0.2 + off], [0.5] * (dim - 1) + [1.2 + off])
     every = {"left": "x", "right": "x", "front": "y", "back": "y"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A slender body needs several points over its thickness; with too few, a warning names it and says what is lost."""
+"""A slender body needs several points over its thickness; with too few, a warning names it and the error."""
 
 import re
 

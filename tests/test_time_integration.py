@@ -102,7 +102,7 @@ def test_a_conductivity_law_is_taken_at_the_stages_of_the_step(width):
 @pytest.mark.parametrize("dt", [1e-2, 1.5e-3, 1e-5])
 @pytest.mark.parametrize("width", [2, 3])
 def test_a_first_step_is_taken_however_long_it_is(width, dt):
-    """From T_v = 1e-5, where nothing has drained; Newton's method then has to see what the fluxes gain by strains."""
+    """From T_v = 1e-5, before any drainage; Newton's method then needs the derivative of fluxes by strains."""
     s, _, cv = hencky_column(width, headroom=5, numerics=mpm.Numerics(method="backward-euler"))
     report = s.step(dt / cv)
     assert report.newton <= 15 and np.ptp(np.sort(s.points.J)[: 2 * width]) < 1e-8
@@ -255,7 +255,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
 
 
 def test_a_jump_of_the_load_within_the_run_is_found():
-    """The load doubles at 7.3 s, between outputs: steps shrink towards it, and the error stays what was asked for."""
+    """The load doubles at 7.3 s, between outputs: steps shrink towards it, and the error stays within its tolerance."""
     jump = [mpm.Traction("top", lambda t: (0, -100.0 if t < 7.3 else -200.0))]
 
     def run(times, **options):
@@ -368,7 +368,7 @@ class Stop:
 
 
 def driven(fails: Callable[[int, float], bool], intervals: int) -> tuple[int, StepControl, list[float]]:
-    """Return cuts, memory and lengths of equal steps, of which those fail that `fails` tells by interval and length."""
+    """Return cuts, memory and lengths of equal steps; `fails` decides from interval and length which ones fail."""
     rule, control, cuts, taken = StepSize(1.0, 1.0), StepControl(small=1.0), 0, []
     for interval in range(intervals):
         left = 1.0

@@ -442,7 +442,7 @@ def test_a_state_with_tools_may_be_put_back():
 
 
 def test_a_disc_that_turns_drives_the_body_by_friction():
-    """Anti-clockwise on its top: to the right; its moment is mu times what it presses with, times its radius."""
+    """Anti-clockwise on its top: to the right; its moment is mu times its pressing force times its radius."""
     turn = {"rotation_rad": lambda t: 0.3 * max(0, t - 1), "centre": (0.5, 0.8), "friction": 0.3}
     s = simple(shape=mpm.Ball((0.5, 0.8), 0.2), tool={"displacement": lambda t: (0, -0.01 * min(t, 1)), **turn})
     s.run(2.0, 0.25)

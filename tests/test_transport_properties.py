@@ -41,7 +41,7 @@ class Motion:
     random: np.random.Generator
 
     def brought(self, pressure, slope, bounds):
-        """Return what the pieces after bring, if those before take this along: what is tested, by its names."""
+        """Return the values of the pieces afterwards, from these values before; the tested code, by its names."""
         old = self.before
         carried = PiecePressures(self.points.id[old.point], old.cell, old.fraction, pressure, self.x, slope, bounds)
         return transport(carried, self.points, self.after)
@@ -141,7 +141,7 @@ def test_an_even_pressure_stays_even(motion):
 
 
 def linear(motion, room):
-    """Return what a pressure that is linear where the body has come ought to be after, and what is brought."""
+    """Return the exact values of a linear pressure after the motion, and the transported ones."""
     slope, middle = motion.random.normal(size=motion.x.shape[1]) / motion.h, motion.x.mean(axis=0)
     p = (motion.x - middle) @ slope
     after = motion.brought(p, np.tile(slope, (len(p), 1)), np.tile([-room, room], (len(p), 1)))
@@ -203,7 +203,7 @@ class Cells:
     origin: np.ndarray
 
     def slopes(self, p=None):
-        """Return slopes (n, d), per cell, and bounds (n, 2) of all cells (what is tested, by its names)."""
+        """Return slopes (n, d), per cell, and bounds (n, 2) of all cells (the tested code, by its names)."""
         h, cells = self.grid.h, np.arange(self.grid.num_owned)
         p = self.p if p is None else p
         sealed = np.full((len(cells), len(h), 2, 2), np.nan)

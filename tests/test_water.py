@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Free water against bodies: what it carries, and what it leaves when it falls."""
+"""Free water against bodies: buoyancy, and pressures that remain when it falls."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Waves leave through quiet sides, which bear what they bore at rest; bases move as they are told."""
+"""Waves leave through quiet sides, which keep their tractions at rest; bases move as prescribed."""
 
 import numpy as np
 import pytest

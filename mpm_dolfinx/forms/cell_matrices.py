@@ -22,7 +22,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the Q1 shape functions at the point as UFL; in 3D, their means over a subdomain."""
+    """Return the gradients of the Q1 shape functions at the point as UFL; in 3D, their means over a piece."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []

@@ -103,7 +103,7 @@ class FormPoints:
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
     def hoop(self, f):
-        """Return f_r / r of a Q1 vector f in axisymmetry: its mean over the cut subdomain of the point."""
+        """Return f_r / r of a Q1 vector f in axisymmetry: its mean over the piece of the point."""
         *offset, product, radius = (self.functions["hoop"][i] for i in range(4))
         slope = ufl.grad(f[0])
         return (f[0] + ufl.dot(slope, ufl.as_vector(offset)) + ufl.grad(slope)[0, 1] * product) / radius
@@ -169,9 +169,9 @@ class Places(Keyed):
     x : (n, d), m
         Positions.
     mixed : (n, d), m^2
-        Mean products of the offsets within a cut subdomain about its centroid, in 3D; see `Pieces`. None: zero.
+        Mean products of the offsets within a piece about its centroid, in 3D; see `Pieces`. None: zero.
     hoop : (n, 4)
-        Moments of axisymmetric subdomains in the plane, see `Pieces`. None: moments of points.
+        Moments of axisymmetric pieces in the plane, see `Pieces`. None: moments of points.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class Places(Keyed):
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at points, or means over subdomains."""
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at points, or means over pieces."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 

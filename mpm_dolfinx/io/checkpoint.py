@@ -35,7 +35,7 @@ from mpm_dolfinx.stepping.step_control import StepControl
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 12  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
-LEAVE = ("pressure", "slope", "bounds")  # of subdomains, not stored when they are cut again
+LEAVE = ("pressure", "slope", "bounds")  # of pieces, not stored when they are cut again
 NODAL = ("velocity", "held", "rest")  # fields of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their types
 
@@ -323,7 +323,7 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
-    """Raise ValueError for arrays that do not belong to cut subdomains of points with these ids."""
+    """Raise ValueError for arrays that do not belong to pieces of points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64

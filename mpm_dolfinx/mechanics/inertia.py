@@ -9,7 +9,7 @@ The weights g and b belong to the substep's own rate and to that of the previous
 velocities are carried from step to step. In each step SDIRK2 dissipates GAMMA^4 (omega dt)^4, 0.74 % of (omega dt)^4,
 of an oscillation's energy. It damps modes that the step cannot resolve.
 
-The mass is integrated over the subdomains of the particle domains, with second moments S about their centroids x_k,
+The mass is integrated over the pieces of the particle domains, with second moments S about their centroids x_k,
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
@@ -274,7 +274,7 @@ class Mass:
     cut
         The cut particle domains.
     pieces
-        Their subdomains, with masses, kg, as weights.
+        Their pieces, with masses, kg, as weights.
     unknowns
         Unknown displacements.
     M, held
@@ -343,7 +343,7 @@ class Mass:
 
     @cached_property
     def _off(self) -> NDArray[np.float64]:
-        """Vectors (m, d), m, from the centroids of the particle domains to the centroids of their subdomains."""
+        """Vectors (m, d), m, from the centroids of the particle domains to the centroids of their pieces."""
         pieces = self._cut.pieces
         return pieces.x - self._cut.mean(pieces.x)[pieces.point]
 

@@ -4,7 +4,7 @@
 Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral: with nu = 0.499 it is up to half too
 stiff. F-bar evaluates the law at a deformation gradient whose volume ratio of the step is the cell's mean theta,
 
-    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking subdomains of the cell.
+    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
 The scaling acts along all three axes: in plane strain the points carry an out-of-plane stretch, as in a slice of the
 body. The material decides whether it locks (`Skeleton.nearly_incompressible`). In a cell of several materials the other
@@ -85,14 +85,14 @@ class MeanDilatation:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Add the subdomains of a part that locks.
+        """Add the pieces of a part that locks.
 
         Parameters
         ----------
         law
             Class of its law.
         points
-            Its subdomains, with the field F (d, d), the deformation gradient at the start of the step.
+            Its pieces, with the field F (d, d), the deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
@@ -127,6 +127,16 @@ class MeanDilatation:
         tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (n theta) I, n = 3 or 2
         mean = ufl.tr(tau) / Fbar.ufl_shape[0]
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
+
+    def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
+        """Return the derivatives by a pressure p, a UFL variable, of both that `_stress` gives."""
+        return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
+
+    def total(
+        self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the cells with pieces that lock, the totals of sums over these, and their volumes (cells, 1)."""
+        return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives by F and by theta of both results of `_stress`.
@@ -170,7 +180,7 @@ class MeanDilatation:
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f to the means of a quantity over the locking subdomains of each cell; sums: its sums (cells, 1)."""
+        """Set f to the means of a quantity over the locking pieces of each cell; sums: its sums (cells, 1)."""
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
@@ -192,7 +202,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
-        """Return the gradients Delta (m, d, d) of the subdomains; locking ones take the volume ratio of their cell."""
+        """Return the gradients Delta (m, d, d) of the pieces; locking ones take the volume ratio of their cell."""
         delta = delta.copy()
         for number in self._numbers:
             rows = data.rows[number]
@@ -204,12 +214,12 @@ class MeanDilatation:
         return [data.parts[number] for number in self._numbers]
 
     def _cells(self, data: QuadratureData) -> Cells:
-        """Return the cells with locking subdomains."""
+        """Return the cells with locking pieces."""
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the volumes (cells, 1) of the locking subdomains."""
+        """Return the volumes (cells, 1) of the locking pieces."""
         key = tuple(part.key for part in self._parts(data))
 
         def volumes() -> NDArray[np.float64]:

@@ -69,9 +69,9 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Positions of the subdomains of a cut, with rows and positions of each part.
+    """Positions of the pieces of a cut, with rows and positions of each part.
 
-    lever (m, d), m: vectors to the subdomains from the centroid of the material in their cell, once they are known.
+    lever (m, d), m: vectors to the pieces from the centroid of the material in their cell, once they are known.
     """
 
     pieces: Places
@@ -80,7 +80,7 @@ class PiecePlaces:
 
 
 class QuadraturePoints:
-    """The subdomains as integration points, with the fields of the scene's forms.
+    """The pieces as integration points, with the fields of the scene's forms.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class QuadraturePoints:
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
 
     def places(self, cut: CutDomains) -> PiecePlaces:
-        """Return the positions of the subdomains of a cut."""
+        """Return the positions of the pieces of a cut."""
         pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, cut.hoop), []
         seen = self._seen(cut, pieces)
         if len(self.laws) > 1 or seen is not pieces:
@@ -218,7 +218,7 @@ class QuadraturePoints:
         return fields
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data that differ between subdomains of one point, if user-defined functions may use them."""
+        """Return the data that differ between pieces of one point, if user-defined functions may use them."""
         fields = {}
         if self._extended or self.varies:
             fields["position"] = cut.pieces.x + cut.grid.base

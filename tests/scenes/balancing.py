@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Forces and fluid of a scene, counted from its points and conditions, not by the scheme.
+"""Forces and fluid of a scene, counted from its points and conditions, independently of the scheme.
 
-Forces by the work of rigid translations: dead loads by the areas of sides as drawn, weights by the masses of points,
-reactions of conditions, tools and walls, and what holds stresses at rest.  Fluid by what the pores of the points hold.
+Forces follow from the work of rigid translations: dead loads by the areas of sides as drawn, weights by the masses of
+points, reactions of conditions, tools and walls, and the nodal forces of an initial stress. Fluid follows from the
+pores of the points.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def held_by_conditions(seed: int, **given) -> Scene:
 
 
 def area(scene: Scene, condition: Condition) -> float:
-    """Return the area of what a condition acts on, as seeded, on the sides of boxes that are free."""
+    """Return the seeded area of a condition on the free sides of boxes."""
     axis, end = SIDES[scene.dim][condition.side]
     total = 0.0
     for number, block in enumerate(scene.bodies):
@@ -103,10 +104,10 @@ def _size(scene: Scene, block: Block, low: NDArray, high: NDArray, axis: int) ->
 
 @dataclass
 class Ledger:
-    """What is counted after each step of a scene, see `counted`.
+    """Values counted after each step of a scene, see `counted`.
 
-    off : largest resultant of all forces, over the largest of them; leaked: fluid that appears or is lost, over what
-    changes places; said: what the worst one is made of.
+    off : largest resultant of all forces, over the largest force; leaked: spurious gain or loss of fluid, over the
+    exchanged fluid; said: terms of the worst one.
     """
 
     off: float = 0.0
@@ -188,9 +189,9 @@ def _pores(built: Built) -> NDArray[np.float64]:
 
 
 def _fluid(built: Built) -> float:
-    """Return the mass of all fluid over its density at no pressure, with what is owed to the points, m^d.
+    """Return the mass of all fluid over its density at zero pressure, with the volume defect of the points, m^d.
 
-    Pressures are those of the pieces that points take from cell to cell, or have in the cells where they stay.
+    Pressures are the pieces' pressures, carried from cell to cell or kept with the cut.
     """
     s, bulk = built.simulation, built.scene.fluid
     points, density = s.points, 1.0
@@ -203,10 +204,10 @@ def _fluid(built: Built) -> float:
 
 
 def _mass(built: Built, taken: NDArray[np.float64]) -> float:
-    """Return the mass of skeleton and fluid, kg; that of the fluid at no pressure, in pores as the balances see them.
+    """Return the mass of skeleton and fluid, kg; fluid at zero pressure fills the pores of the balances.
 
-    taken: what points owed and was due when the step began (2, n).  The volumes of their domains differ by what of it
-    has changed.
+    taken: volume defect and correction of the points at the start of the step (2, n). The volumes of their domains
+    differ by the change of it.
     """
     points = built.simulation.points
     grains = points.volume0 * (1 - _of_points(built, "porosity")) * _of_points(built, "grain_density")
@@ -218,6 +219,6 @@ def _mass(built: Built, taken: NDArray[np.float64]) -> float:
 
 
 def _owed(built: Built) -> NDArray[np.float64]:
-    """Return what is owed to the points, and due (2, n), over their volumes at rest."""
+    """Return volume defect and correction of the points (2, n), over reference volumes."""
     data = built.simulation.points.data
     return np.stack([data["owed"], data["due"]]) if "owed" in data else np.zeros((2, 1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""By how much two runs of a scene differ, and what a scene makes of a disturbance."""
+"""Differences between two runs of a scene, and the amplification of a disturbance by a scene."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def differences(scene: Scene, one: Sequence[Shown], other: Sequence[Shown]) -> d
     return out
 
 
-OF_POINTS = ("displacement", "stress", "volume", "pressure")
+OF_POINTS = ("displacement", "stress", "volume", "pressure", "saturation")
 
 
 def softest(scene: Scene) -> float:
@@ -47,12 +47,12 @@ def softest(scene: Scene) -> float:
 
 
 def _seeps(scene: Scene) -> float:
-    """Return what flows by an area under gravity alone, m/s."""
+    """Return the flow through a unit area under gravity alone, m/s."""
     return max(law.get("conductivity", 0.0) for _, law in scene.materials) if scene.gravity else 0.0
 
 
 def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
-    """Return the largest value of each field; of those that are nothing a small part of what there is."""
+    """Return the largest value of each field; for zero fields a small fraction of a reference value."""
 
     def most(name: str) -> float:
         return max(float(np.nanmax(np.abs(s.fields[name]), initial=0.0)) for s in run if name in s.fields)
@@ -66,6 +66,8 @@ def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
     for name in ("reactions", "tools"):
         found[name] = max(found[name], 1e-3 * stress * h ** (d - 1))
     found["outflows"] = max(found["outflows"], 1e-3 * (moved / scene.end + _seeps(scene)) * h ** (d - 1))
+    if "rain" in found:
+        found["rain"] = max(found["rain"], found["outflows"] * scene.end)
     found["travel"] = max(found["travel"], LEAST * h)
     return found
 
@@ -77,11 +79,11 @@ def stress_of_rounding(scene: Scene) -> float:
 
 
 def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, float]:
-    """Return what the rounding of coordinates in a frame is in each field, over the largest value of the field.
+    """Return the rounding error of coordinates in a frame for each field, over the largest value of the field.
 
-    A place is given, and shown, to the last digit of a coordinate: so far from the origin scenes differ by that over a
-    cell, and displacements by that.  On the grid a place is known to the last digit of the grid's size, a strain to
-    that over a cell, a stress to the stiffest modulus times that; what holds sides and tools is so many times stiffer.
+    A position is given, and shown, to the last digit of a coordinate. Far from the origin strains thus differ by this
+    digit over a cell, and displacements by the digit. On the grid a position has the last digit of the grid's size, a
+    strain this over a cell, a stress the stiffest modulus times this. Supports and tools are stiffer by a factor.
     """
     scales, h, d = _scales(scene, run), min(scene.h), scene.dim if not scene.axisymmetric else 3
     most = np.abs(frame.place([np.zeros(scene.dim), scene.size], scene)).max() / frame.length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Transformations that must not change what a scene shows."""
+"""Transformations that must not change the results of a scene."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Frame:
         return len(self.axes)
 
     def vector(self, v) -> NDArray[np.float64]:
-        """Return vectors (..., d) of the description in this frame; infinite components stay what they are."""
+        """Return vectors (..., d) of the description in this frame; infinite components do not change."""
         return np.asarray(v, dtype=float)[..., list(self.axes)] * self.signs
 
     def vector_back(self, v) -> NDArray[np.float64]:
@@ -96,7 +96,7 @@ class Frame:
         return self.stress * self.time**2 / self.length**2
 
     def force(self, scene: Scene) -> float:
-        """Return the factor of forces: in plane strain those of a slice of one unit of length."""
+        """Return the factor of forces; in plane strain they act on a slice of unit thickness."""
         plane = scene.dim == 2 and not scene.axisymmetric
         return self.stress * (self.length if plane else self.length**2)
 
