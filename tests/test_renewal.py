@@ -254,7 +254,7 @@ def test_clay_is_pressed_through_a_die_of_half_its_width(cells=9, depth=1.0, str
 
     The die's edge lies in the middle of a cell, rounded by a cell: over a sharp one the surface catches.
     """
-    h, long = 1 / cells, depth + 0.75
+    h, long = 1 / cells, depth + 1.5
     low, high = -np.ceil((2 * depth + 0.75) * cells) / cells, np.ceil((long + 0.25) * cells) / cells
     grid = mpm.Grid([0, low + h / 2], [1, high + h / 2], [cells, round((high - low) * cells)])
     angle = np.linspace(np.pi, np.pi / 2, 7)
