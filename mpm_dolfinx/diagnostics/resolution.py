@@ -138,8 +138,9 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
     """Warn about each slender body that can bend and has too few points over its thickness.
 
     The increment of stress is constant in a cut domain, so n points over the thickness give 1 - 1/n^2 of the bending
-    stiffness in a single step, and more in several (`domain_slopes`).  A single point carries no moment.  Only the increment of a step resists, and the body
-    creeps from step to step.  Saturated bodies (wet) lose more, as measured, and continue to creep.
+    stiffness in a single step, and more in several (`domain_slopes`).  A single point carries no moment.  Only the
+    increment of a step resists, and the body creeps from step to step.  Saturated bodies (wet) lose more, as measured,
+    and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):

@@ -51,15 +51,18 @@ class Neighbours:
         self.rows = rows = np.flatnonzero(chosen & (ids < starts[-1]))
         """The points (k,) with neighbours."""
         dim = bodies[0].dim
-        of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.uint64)
+        of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.int64)
         for i, body in enumerate(bodies):
             here = np.flatnonzero(of == i)
-            nodes = body.nodes(ids[rows[here]] - starts[i]).astype(np.uint64) + np.uint64(i << 48)
-            key[here] = _mixed(nodes)[:, FACES[dim]].sum(axis=2, dtype=np.uint64)  # equal for equal corners
+            corners = (2**dim * starts[i] + body.nodes(ids[rows[here]] - starts[i]))[:, FACES[dim]]
+            # equal for both sides of a face: its lowest corner, and the one diagonally opposite
+            first = corners.argmin(axis=2)[:, :, None]
+            ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
+            key[here] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
         key = key.ravel()
         partner = _pairs(key)
         self._lone = np.flatnonzero(partner < 0)
-        self._to_home = Exchange(comm, (key[self._lone] % np.uint64(comm.size)).astype(np.int32))
+        self._to_home = Exchange(comm, (key[self._lone] % comm.size).astype(np.int32))
         self._there = _pairs(self._to_home.send(key[self._lone]))
         found = self._to_home.back(self._there >= 0)
         partner[self._lone[found]] = len(key) + np.flatnonzero(found)
@@ -113,15 +116,7 @@ class LinearGradients:
         )
 
 
-def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return hashes of whole numbers whose sums hardly collide (splitmix64, Steele et al. 2014)."""
-    x = x + np.uint64(0x9E3779B97F4A7C15)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
-
-
-def _pairs(key: NDArray[np.uint64]) -> NDArray[np.int64]:
+def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index (n,) of the other entry with the same key, -1 without."""
     order, out = np.argsort(key, kind="stable"), np.full(len(key), -1)
     same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
@@ -146,7 +141,8 @@ def within(
         Equal rows mark points of the same material.
     """
     # arrays have points or pieces last: rows of a few numbers each would take numpy several times as long
-    of, d, k, fraction = cut.pieces.point, cut.grid.dim, F.shape[1], cut.pieces.fraction
+    of, fraction = cut.pieces.point, cut.pieces.fraction
+    d, k = cut.grid.dim, F.shape[1]
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
     slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, alike)
     apart = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
@@ -176,7 +172,8 @@ def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], alike: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return slopes (d, k, k, r) of F by the coordinates xi of domains, and their inverse edges (d, d, r), 1/m."""
-    rows, d, k = neighbours.rows, cut.grid.dim, F.shape[1]
+    rows = neighbours.rows
+    d, k = cut.grid.dim, F.shape[1]
     corners, bits = np.moveaxis(cut.points.corners[rows], 0, 2).copy(), corner_bits(d)
     faces = [corners[bits[:, a] == end].mean(axis=0) for a in range(d) for end in (0, 1)]
     edges = np.stack([faces[2 * a + 1] - faces[2 * a] for a in range(d)], axis=1)
