@@ -56,7 +56,7 @@ from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts
-from mpm_dolfinx.pores.retention import Retentions, restrained
+from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
 
 FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
@@ -189,14 +189,20 @@ class StorageForms:
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
-    def driven(self, assembled: FacetSum, active: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the outflow that p and the fluid's weight drive from active cells to others, m^d/s, a local array."""
-        if self.fluxes.relative is not None:
-            self.fluxes.relative.set_pressures(self.p.x.array)
+    def driven(
+        self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """Return the outflow that p and the fluid's weight drive from active cells to others, m^d/s, a local array.
+
+        force (c, d): of inertia on the fluid in the local cells, N/m^3, if there is any.
+        """
+        relative, borders = self.fluxes.relative, None
+        if relative is not None:
+            borders = relative.set_pressures(self.p.x.array, force)
         self._work.x.array[active] = 0.0
         assembled.assemble_vector(self._work.x.array)
-        if self.fluxes.relative is not None and self.fluxes.relative.borders is not None:
-            self.fluxes.relative.borders.add_fluxes(self._work.x.array)
+        if borders is not None:
+            borders.add_fluxes(self._work.x.array)
         return sum_ghosts(self._work)
 
 
@@ -328,15 +334,16 @@ class StorageSystem:
             aslant = AslantFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
 
-    def assemble_fluxes(self) -> None:
-        """Assemble the matrix of the fluxes between cells, where pores drain at p."""
+    def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
+        """Assemble the matrix of the fluxes between cells, where pores drain at p; force: see `StorageForms.driven`."""
         zero(self.T)
-        if (relative := self._forms.fluxes.relative) is not None:
-            relative.set_pressures(self._forms.p.x.array)
+        relative, borders = self._forms.fluxes.relative, None
+        if relative is not None:
+            borders = relative.set_pressures(self._forms.p.x.array, force)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
-        if relative is not None and relative.borders is not None:
-            relative.borders.add_slopes(self.T, self.unknowns)
+        if borders is not None:
+            borders.add_slopes(self.T, self.unknowns)
         self.T.assemble()
 
 
@@ -523,11 +530,18 @@ class StorageProblem:
         """Relative accuracy that a linear solve needs: dry cells store next to nothing, and what is left is theirs."""
         return SAME if self.forms.retains else 1.0
 
-    def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,)."""
+    def restrained(
+        self, dp: NDArray[np.float64], went: NDArray[np.float64] | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
+        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
+
+        Also, where pores drain, by how much the logarithm of their suction changes; went: the same of the step before.
+        """
         if self._scale is None:
-            return dp
-        return restrained(self.forms.p.x.array[self.system.unknowns.owned], dp, self._scale)
+            return dp, went
+        p = self.forms.p.x.array[self.system.unknowns.owned]
+        dp = restrained(p, dp, self._scale, went)
+        return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
         """Open and close what asks for it by the flow at (u, p); return whether that has changed anything.
@@ -594,15 +608,17 @@ class StorageProblem:
 
     def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
-        system, fluid, relative = self.system, self._fluid, self.forms.fluxes.relative
+        system, fluid = self.system, self._fluid
+        force = None
         if self._inertial is not None:
             fluid = fluid._replace(force=self._inertial())
-            if relative is not None and relative.borders is not None:
-                relative.borders.set_force(system.unknowns.owned, fluid.force)
+            force = self._local(fluid.force)
         if system.gravity is None:
             cells = system.between(fluid.pi) + self._aslant
         else:
-            cells = self.forms.driven(system.gravity, self._contents.active)[system.unknowns.owned] + self._aslant
+            cells = (
+                self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned] + self._aslant
+            )
         lost, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):
@@ -610,6 +626,12 @@ class StorageProblem:
             lost, gain = lost + leaving.cells, gain + leaving.gain
             turnover = turnover + leaving.turnover
         return Rates(cells + lost, lost, turnover, gain)
+
+    def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (n, d) of the active owned cells in an array (c, d) of the local ones."""
+        out = np.zeros((self.forms.grid.num_local, values.shape[1]))
+        out[self.system.unknowns.owned] = values
+        return out
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
         """Return the fluid (n,), m^d, that came to the filled owned cells in the step by fluxes and sources.
@@ -632,7 +654,7 @@ class StorageProblem:
             A.assemble()
         if forms.fluxes.relative is not None:
             self._flow(False)
-            system.assemble_fluxes()
+            system.assemble_fluxes(None if self._inertial is None else self._local(self._inertial()))
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
