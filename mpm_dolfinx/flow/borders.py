@@ -72,8 +72,9 @@ class Borders:
         self._axis = np.abs(way).argmax(axis=1)
         falls = np.take_along_axis(way, self._axis[:, None], axis=1) < 0
         self._pair = np.where(falls, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
-        self._cells, slot = np.unique(self._pair, return_inverse=True)
-        self._slot = slot.reshape(self._pair.shape)
+        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # ask for those of any of ours
+        self._cells = np.unique(np.append(self._pair, of_others))
+        self._slot = np.searchsorted(self._cells, self._pair)
 
     def faces(
         self, laws: Laws, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
