@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A bank of clay loses its strength and slides against a rigid barrier: run-out with and without it, force on it.
+"""A bank of clay loses its strength and slides against a rigid barrier: run-out, and force on the barrier.
 
 Half of a bank of undrained clay, 10 m high and as long, stands with a vertical side on a rough floor.  Within ten
-minutes its strength c falls from 0.3 to 0.07 gamma H; 0.26 would hold it.  Inertia is left out: a viscous stress
-2 eta D, a term in UFL, lets the clay move only so far in so much time, and is gone when it rests.  A wall that takes a
-shear of c / 2 stands in its way.
+minutes its strength c falls from 0.3 to 0.07 gamma H; it would stand with 0.26.  Inertia is neglected.  A viscous
+stress 2 eta D, a term in UFL, limits the velocity and vanishes at rest.  A wall with an adhesion of c / 2 stops the
+clay.
 
-At rest no plane bears more than c.  So each wedge between the wall and a plane through its foot, of weight W, at the
-angle theta and of length l, bounds the force F normal to the wall, on which the shear V is at most c D / 2, D the depth
-of clay there:
+At rest the shear stress on any plane is at most c.  Take a wedge between the wall and a plane through its foot, of
+weight W, angle theta and length l.  It bounds the force F normal to the wall.  The shear V on the wall is at most
+c D / 2, with D the depth of clay there:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
-The largest of the first is Coulomb's active force and the least of the second his passive one, for the surface as it is
-(Culmann 1866).  Planes that end in the axis are left out.  What has slid against the wall and stopped is in between.
+The largest lower bound is Coulomb's active force, and the smallest upper bound his passive force, for the present
+surface (Culmann 1866).  Planes that end in the axis are left out.  The measured force at rest lies between both.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
     parser.add_argument("--steps", type=int, default=60, help="steps in which the cohesion is lost")
@@ -155,7 +155,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: dict) -> None:
-    """Print what has come of it."""
+    """Print the results."""
     print(f"run-out: {out['run_out']:.2f} m, with the barrier {out['held']:.3f} m; it stands at {WALL:g} m")
     print(f"clay at the barrier: {out['depth']:.2f} m; its force acts at {out['arm']:.3f} of that")
     kN = {name: out[name] / 1e3 for name in ("force", "most", "active", "passive")}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Where one linear solver becomes better than another: both are timed on each side of the thresholds of the plan.
+"""Thresholds between linear solvers: both solvers are timed on each side of the thresholds of the plan.
 
-Each row is a scene of so many unknown displacements, stepped with the threshold moved so that either route is taken.
-Times are processor times of two steps, the least of --repeat turns.  The table stands in
+Each row is a scene of a given number of displacement unknowns.  The threshold is moved so that either solver is used.
+Times are processor times of two steps, the shortest of --repeat turns.  The table is in
 `mpm_dolfinx/solve/solver_choice.py`.
 """
 
@@ -44,7 +44,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""By the name of a threshold: a scene of so many cells along an axis, and such numbers, then those of --quick."""
+"""For each threshold: a scene by its cells along an axis, numbers of cells, and numbers of cells with --quick."""
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:

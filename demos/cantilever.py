@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A cantilever bends until it hangs: large deflection under a dead load at its end.
+"""Large deflection of a cantilever under a dead load at its end, until it hangs.
 
-A dry, slender beam of 1 m x 0.05 m, clamped at its left end, carries a dead load P, spread evenly over
-its right end: alpha = P L² / (E I) = 1, 2, 5 and 10, P per depth, I = height³ / 12.  Its tip drops by
-0.81 L and comes back by 0.56 L.  E = 12 MPa and nu = 0, so that plane strain is plane stress.  Of the
-package's laws neo-Hooke's is the nearest to a rod's linear one: its stress is E (e - e²/2 + ...) at a strain e.
+A dry, slender beam of 1 m x 0.05 m, clamped at its left end, carries a dead load P, spread evenly over its right end.
+The load parameter is alpha = P L² / (E I) = 1, 2, 5 and 10, with P per depth and I = height³ / 12.  At the end the
+tip has dropped by 0.81 L and shortened by 0.56 L.  E = 12 MPa and nu = 0, so plane strain equals plane stress.  Of
+the package's laws, neo-Hooke's is closest to the linear law of a rod: its stress is E (e - e²/2 + ...) at a strain e.
 
-Beside it: the elastica (Bisshopp & Drucker 1945), which neither stretches nor shears, and a
-geometrically exact rod that does both (Reissner 1972, Simo 1985), with E A, 5/6 G A and E I.  On one
-process.
+Two references: the elastica (Bisshopp & Drucker 1945), without stretch and shear, and a geometrically exact rod with
+both (Reissner 1972, Simo 1985), with E A, 5/6 G A and E I.  On one process.
 
-Errors: `v_1` to `v_10` and `u_1` to `u_10`, the distance of the tip's deflection v and shortening u from
-the rod's, over L, at each alpha.  With 8 cells over the height and 40 steps: 0.05 %, 0.11 %, 0.13 %,
-0.12 % and 0.02 %, 0.07 %, 0.14 %, 0.16 %.  Of these 0.01 %, 0.03 %, 0.06 %, 0.08 % and 0.00 %, 0.01 %,
-0.05 %, 0.08 % are the rod's own: converged finite elements of the same body differ from it by so much.
-To those the material points converge, with the square of the cell size in the end.
+Errors `v_1` to `v_10` and `u_1` to `u_10`: distance of the tip's deflection v and shortening u from the rod's, over
+L, at each alpha.  With 8 cells over the height and 40 steps: 0.05 %, 0.11 %, 0.13 %, 0.12 % and 0.02 %, 0.07 %, 0.14
+%, 0.16 %. The rod itself contributes 0.01 %, 0.03 %, 0.06 %, 0.08 % and 0.00 %, 0.01 %, 0.05 %, 0.08 %, as converged
+finite elements of the same body show.  The material points converge to these elements, finally with the square of the
+cell size.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the height")
     parser.add_argument("--steps", type=int, default=40, help="equal increments of the load to alpha = 10")
@@ -100,7 +99,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
-    """Print the tip's deflection and shortening beside the rod and the elastica."""
+    """Print deflection and shortening of the tip, the rod and the elastica."""
     print("alpha |     v/L      rod elastica  v - rod |     u/L      rod elastica  u - rod")
     for alpha, axis in out.axis.items():
         (x, y), (rod_x, rod_y), (u, v) = axis[-1] / LENGTH, rod(alpha)[-1] / LENGTH, elastica_tip(alpha)
@@ -109,7 +108,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the deformed axes beside the rod's, and the tips beside those of the elastica."""
+    """Draw the deformed axes with the rod's, and the tips with the elastica's."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.8))
     for i, (alpha, axis) in enumerate(out.axis.items()):
         left.plot(*rod(alpha).T, color="black", lw=1, label=None if i else "shear-flexible rod")

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A square cantilever in 3D, pulled aslant: its tip, the number of load steps, and what a step costs.
+"""A square cantilever in 3D with a load inclined to the grid: tip, number of load steps, and cost of a step.
 
-A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5:
-aslant to the grid.  A square bends alike about all axes, so it must move in the direction of the load, as the
-geometrically exact rod does that stretches and shears (Reissner 1972, Simo 1985).  The load parameter is
-alpha = P L² / (E I).  The material is elastic: the answer must not depend on the number of steps, which is
-the test of the domains' exact pieces.  Runs on any number of processes; --profile says what a step costs.
+A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5.  A
+square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, as
+the geometrically exact rod with stretch and shear does (Reissner 1972, Simo 1985).  The load parameter is alpha = P
+L² / (E I).  The material is elastic, so the answer must not depend on the number of steps.  This tests the exact
+integration of the particle domains.  Runs on any number of processes; --profile prints the cost of a step.
 
-Errors, over L: `v` and `u`, the distance of the tip's deflection and shortening from the rod's, `w`, its
-displacement across the load, and `drift`, the tip's greatest distance from that of most steps.
+Errors over L: `v` and `u`, distance of the tip's deflection and shortening from the rod's.  `w` is the displacement
+across the load.  `drift` is the largest distance of the tip from its position with the most steps.
 
-The tip goes too far as stress is constant in a point's domain: n of them over the height bend by 1/n² too much.
+The tip moves too far because the stress is constant in each domain: with n domains over the height, by 1/n².
 `v` with 2, 4 and 8 cells (n = 4, 8, 16), in 10 steps: 0.0129, 0.0034, 0.0010; in the plane 0.0127, 0.0033, 0.0010.
 """
 
@@ -93,7 +93,7 @@ def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--cells", type=int, default=4, help="cells over the height")
@@ -133,7 +133,7 @@ def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
 
 
 def report(o: Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
-    """Print the tips beside the rod's."""
+    """Print the tips and the rod's."""
     u, v = rod(o.alpha)
     rows = {steps: (tip @ ALONG, tip @ ACROSS, -tip[0]) for steps, tip in zip(o.steps, tips, strict=True)}
     head = ["load steps", "along (m)", "across (m)", "shortening (m)"]

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""A cylindrical cavity is widened in clay and in sand, on a grid of squares.
+"""Expansion of a cylindrical cavity in clay and in sand, on a grid of squares.
 
-A quarter of a ring of soil, b = 5 a0.  The given displacement of its wall is a fifth of a cell in a step, undrained a
-tenth: laws with history are integrated to first order, and with eight cells and steps of a fifth the radial solution
-itself has pore pressures that are 1.5 % too low at a = 1.1 a0, where normally consolidated clay is still yielding.
+A quarter of a ring of soil has b = 5 a0.  The prescribed displacement of its wall is a fifth of a cell in a step, and a
+tenth if undrained, because laws with history are integrated to first order.  With eight cells and steps of a fifth of a
+cell, the radial solution itself has pore pressures 1.5 % too low at a = 1.1 a0 in yielding normally consolidated clay.
 
-1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water moves, its outside
-   under the pressure that it began with.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
-2. Then the wall is held and the clay drains at its outside: its excess pressures dissipate.
-3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr and Coulomb's sand, phi = 30
-   degrees, without and with associated dilation (Yu and Houlsby 1991).  These are in soil without end: the outside of
-   the ring goes where a radial solution has it (`mpm_dolfinx.verification.cavity`).
+1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water flows.  The outside
+   keeps its initial pressure.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
+2. Then the wall is fixed and the clay drains at its outside: its excess pressures dissipate.
+3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
+   degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
+   outside of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
-Pressures are over p_0.  Errors are those at the marks, relative.
+Pressures are over p_0.  Errors are relative, at the marks.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, whose indices are those of v over the Cauchy stress."""
+    """Return the clay of Chen and Abousleiman, with indices of v over the Cauchy stress."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
@@ -127,7 +127,7 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 
 @dataclass
 class Undrained:
-    """What an undrained push and the consolidation after it give.
+    """Results of an undrained expansion and of the consolidation after it.
 
     total, water: radius -> pressure in the hole less p_0, and pore pressure at its wall, over p_0, with the exact ones;
     profiles: (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
@@ -176,7 +176,7 @@ def push(OCR: float, cells: int) -> Undrained:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius")
     parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained ones")

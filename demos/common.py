@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the demos share: options, first and last lines, tables, pictures, and two terms in UFL."""
+"""Functions of several demos: options, first and last lines, tables, pictures, and two terms in UFL."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GALLERY = Path(__file__).with_name("README.md")
 
 
 class Parser(argparse.ArgumentParser):
-    """The options of a demo: those that it adds, --json and, of one that writes files, --out.
+    """The options of a demo: its own, --json and, if it writes files, --out.
 
     processes: whether it runs on several.
     """
@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
         return o
 
     def refuse_processes(self, what: str = "") -> None:
-        """End a demo that several processes run: what it prints and draws would be that of some of the points."""
+        """End a demo on several processes: its output would cover a part of the points only."""
         if (size := MPI.COMM_WORLD.size) == 1:
             return
         if not first():
@@ -64,7 +64,7 @@ class Parser(argparse.ArgumentParser):
 def results(o: argparse.Namespace) -> Iterator[dict]:
     """Yield the results of a run for the demo to fill; print before how long it takes, and them after it (--json).
 
-    A run that gives up (`mpm.GaveUp`) ends with a line; `converged` is False then, and what was found is kept.
+    A run that gives up (`mpm.GaveUp`) ends with a line.  Then `converged` is False, and earlier results are kept.
     """
     out, start = {}, time.perf_counter()
     if first() and o.takes:
@@ -91,7 +91,7 @@ def first() -> bool:
 
 
 def whole(s: mpm.Simulation, *names: str) -> list[np.ndarray]:
-    """Return what the points of all processes carry under some names, by the points' numbers."""
+    """Return named fields of the points of all processes, ordered by the points' numbers."""
     parts = s.grid.comm.allgather([getattr(s.points, name) for name in ("id", *names)])
     ids, *values = map(np.concatenate, zip(*parts, strict=True))
     return [each[np.argsort(ids)] for each in values]

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""How many iterations the coupling of displacement and pore pressure takes, from drained to undrained.
+"""Iterations of the coupling between displacement and pore pressure, from drained to undrained.
 
-The linear systems of Newton's first step are solved to 1e-8 (true residual) for a cantilever (the
-poroelastic beam, at rest and bent) and a footing on a column.  The product of conductivity and step, which alone
-matters, goes from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s), the water from soft (1e4 Pa)
-to incompressible.  Compared are the package's conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with the
-filtered fixed-stress operator C + beta (V - 3/4 L) and with the plain one, C + beta V; and the plain
-fixed-stress iteration (Richardson's) with beta = 0.5, 0.75 and 1 times alpha²/K_dr and with 1/K_w,
+The linear systems of Newton's first step are solved to 1e-8 (true residual).  Scenes are a cantilever (the poroelastic
+beam, at rest and bent) and a footing on a column.  Only the product of conductivity and step matters.  It goes from
+1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The water goes from soft (1e4 Pa) to incompressible.
+
+Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with
+the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C + beta V.  The
+third is the plain fixed-stress (Richardson) iteration with beta = 0.5, 0.75 and 1 times alpha²/K_dr, and with 1/K_w,
 which diverges.  An iteration is one solve of the storage and one of the momentum.
 
-Undrained, Q1/DG0 does not see checkerboard modes of the pressure.  Only the damping of pressure jumps
-(`storage.py`) bounds them, and with them the count.  The second picture shows the pressure with and without it.
+Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
+bounds them, and with them the number of iterations.  The second picture shows the pressure with and without it.
 """
 
 from __future__ import annotations
@@ -209,7 +210,7 @@ def undrained(h: float, law: type[mpm.Hencky]) -> tuple[mpm.Simulation, mpm.Resu
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, nargs="+", default=[0.06, 0.03, 0.015], help="cell sizes, m")
     parser.add_argument("--quick", action="store_true", help="coarser: every other k dt, hard water only")
@@ -272,7 +273,7 @@ def tabulate(path: Path, rows: list[list[str]]) -> None:
 
 
 def draw(o: Namespace, counts: list[Count]) -> None:
-    """Draw iterations against k dt: the scenes beside each other, a colour a scheme, a line style a cell size."""
+    """Draw iterations against k dt: panels are scenes, colours schemes, line styles cell sizes."""
     fig, ((*axes, side),) = common.figure(1, len(SCENES) + 1, (16, 4.6))
     styles = dict(zip(o.h, ("-", "--", ":", "-."), strict=False))
     for ax, scene in zip(axes, SCENES, strict=True):
@@ -295,7 +296,7 @@ def draw(o: Namespace, counts: list[Count]) -> None:
 
 
 def draw_pressure(o: Namespace, runs: dict) -> None:
-    """Draw the undrained pressure of the cells beside each other, for the middle one of the cell sizes."""
+    """Draw the undrained pressure of the cells in two panels, for the middle cell size."""
     h = o.h[len(o.h) // 2]
     fig, (axes,) = common.figure(1, len(LAWS), (13, 3.9))
     limit = np.nanmax(np.abs(cells(runs[h, "damped"][0]))) / 1e3

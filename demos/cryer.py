@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Cryer's sphere: pressed all around and drained at its surface, the pressure at its centre rises at first.
+"""Cryer's sphere: loaded all around and drained at its surface, with a rise of pressure at its centre.
 
-A saturated ball is loaded by an even normal traction p0 at once, and kept; its surface is drained.  The outer
-shell gives up its water, shrinks and presses on the core: the pressure at the centre rises by nearly a third above
-p0 before it falls (Cryer 1963), which no uncoupled theory of consolidation can show.  Fluid and grains are
-incompressible, nu = 0.25.  One octant is computed: a lattice of boxes, bent into the ball by a smooth map; or, with
---axisymmetric, a quarter of a disc.
+A saturated sphere is loaded at once by a constant normal traction p0, and its surface is drained.  The outer shell
+drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
+falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Fluid and grains are incompressible,
+nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the sphere; with --axisymmetric, a quarter
+of a disc.
 
-Errors, of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its
-greatest value, and `curve`, the greatest over T from 0.02 on, over p0.
+Errors of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its largest
+value, and `curve`, the largest over T from 0.02 on, over p0.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
 
 @dataclass
 class Outcome:
-    """Reduced times (m,), pressures at the centre over p0 (m,), and what the run took."""
+    """Reduced times (m,), pressures at the centre over p0 (m,), and the cost of the run."""
 
     T: np.ndarray
     pressure: np.ndarray
@@ -106,7 +106,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")
@@ -127,7 +127,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
-    """Print the pressure at the centre beside the exact one."""
+    """Print the pressure at the centre and the exact one."""
     shown = np.unique(np.linspace(0, len(out.T) - 1, 13).astype(int))
     rows = ([f"{x:.4f}" for x in (out.T[k], out.pressure[k], exact(out.T[k]))] for k in shown)
     common.table([["T", "p/p0", "exact"], *rows])
@@ -137,7 +137,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure at the centre beside the exact one."""
+    """Draw the pressure at the centre and the exact one."""
     fig, ((ax,),) = common.figure(1, 1, (7, 4.5))
     T = np.linspace(1e-3, out.T[-1], 400)
     ax.plot(T, exact(T), color="black", lw=1, label="Cryer (1963)")

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""A body that comes back: what load cycles and a turn by 360 degrees leave in it.
+"""Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
-The drained beam of `poroelastic_beam.py` is loaded and unloaded again and again.  It is elastic: without load it must
-be free of stress.  The grid's displacements have kinks at grid lines.  Domains that followed them would collect stress
-with every line that they cross, as standard MPM does at its points.  A block that is stretched between two held sides
-and then turned by 360 degrees must end with the stresses that it began with.  Undrained the beam is clamped at singular
-edges: the stress there is that of r^(x - 1), cos(pi x / 2) = x, x = 0.595 (Williams 1952), so its rms within a few
-cells of them falls as h^x, and so does the stress that is left.  It is given for the whole beam, far from the clamp,
-near it, and with springs in its place.
+The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly.  It is elastic, so it must be free of
+stress without load.  The grid's displacements have kinks at grid lines.  Domains that follow these kinks would
+collect stress with every line that they cross, as the points of standard MPM do.
+
+A block is stretched between two fixed sides and then rotated by 360 degrees.  It must end with its initial stresses.
+
+The undrained beam has singular edges at its clamp.  The stress there is singular as r^(x - 1), with cos(pi x / 2) = x,
+x = 0.595 (Williams 1952).  Its rms within a few cells of the edges falls as h^x, and so does the residual stress.  The
+results are for the whole beam, far from the clamp, near it, and with springs in its place.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the root mean square of the points' stress, Pa, that of those nearer to the wall than `away` as none."""
+    """Return the root mean square of the points' stress, Pa, with zero for points nearer to the wall than `away`."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -63,7 +65,7 @@ def cycle(
     fluid: mpm.Fluid | None = None,
     springs: float = 0.0,
 ) -> dict:
-    """Load and unload the beam; return what is left of it, and how it has moved.
+    """Load and unload the beam; return the residual stress and the motion.
 
     Parameters
     ----------
@@ -86,8 +88,8 @@ def cycle(
     Returns
     -------
     left: rms of the stress after each cycle over that at the first peak; away: the same but at the wall; times, tips
-    (m): of each step; lost: work that the load has done in each cycle over that up to the first peak; volume: change of
-    the beam's beside that of its water; balance: of the fluid.
+    (m): of each step; lost: work of the load in each cycle over that up to the first peak; volume: change of the beam's
+    volume less that of its water; balance: of the fluid.
     """
     o = options(h, load, quadrature)
     cells = np.rint(beam.BOX / h).astype(int)
@@ -187,7 +189,7 @@ def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
         "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; standard MPM: the last"
@@ -257,7 +259,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndarray, np.ndarray]) -> None:
-    """Draw the stress that is left against the cycles, and the last cycle beside the finite elements."""
+    """Draw the residual stress against the cycles, and the last cycle with the finite elements."""
     fig, ((left, loop),) = common.figure(1, 2, (11, 4.2))
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
         left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")

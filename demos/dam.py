@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
 """A dam: seepage with a free surface, as the reservoir falls.
 
-A dam of 6 m with slopes of 1:2 on an impervious base.  The water of its pores is level with the reservoir, 5 m, when
-its other slope is opened; the flow settles to a steady one.  Then the reservoir falls by 2 m in five days, and the
-free surface follows as the soil drains.  Water flows below the free surface only, and pores lose a tenth of the soil's
-volume as it falls (`mpm.unsaturated`); the reservoir presses on the slope that it wets, and both slopes are seepage
-faces above it.
+A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the pore water is level with the reservoir, 5
+m. Then the other slope is opened, and the flow becomes steady.  Then the reservoir falls by 2 m in five days, and the
+free surface follows as the soil drains.  Water flows below the free surface only.  As the surface falls, a tenth of
+the soil's volume drains from the pores (`mpm.unsaturated`).  The reservoir loads the wet slope.  Above the water,
+both slopes are seepage faces.
 
-Check: `flow`, what leaves a rectangular dam (10 m and 2 m of water at its sides, 9.6 m wide) over the exact
-k (H1^2 - H2^2) / (2 L) of Dupuit and Charny, whatever its free surface is; `steady`, what enters the dam over what
-leaves it before the reservoir falls; and `drained`, what a column loses until the free surface in it has fallen from
-8 m to 4 m above its base, where the head is 2 m, over the exact one.
+Checks:
+
+* `flow`: outflow of a rectangular dam over the exact k (H1^2 - H2^2) / (2 L) of Dupuit and Charny.  The dam is 9.6 m
+  wide, with 10 m and 2 m of water at its sides;
+* `steady`: inflow of the dam over its outflow, before the reservoir falls;
+* `drained`: outflow of a column over the exact one.  Its free surface falls from 8 m to 4 m above its base, where the
+  head is 2 m.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: of the reservoir's fall; after it 
 
 @dataclass
 class Dam:
-    """What has been seen in steady flow and at each of `SEEN`: flows, corners and pressures.
+    """Flows, corners and pressures in steady flow and at each of `SEEN`.
 
     flows: (2,), m^2/s, out of both slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
     """
@@ -53,7 +56,7 @@ class Dam:
         self.balance = max(self.balance, result.balance)
 
     def see(self, simulation: mpm.Simulation) -> None:
-        """Keep what is to be seen now."""
+        """Keep the present flows, corners and pressures."""
         self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
@@ -122,7 +125,7 @@ def rectangular(cells: int) -> float:
 
 
 def drained(cells: int, k: float = 1e-5) -> float:
-    """Return what a column of 10 m, so many cells high, loses as its free surface falls, over the exact one.
+    """Return the outflow of a column of 10 m over the exact one as its free surface falls; cells over its height.
 
     With the heads h of the free surface and H at the base, dh/dt = -k (1 - H / h) / (specific yield).
     """
@@ -149,7 +152,7 @@ def drained(cells: int, k: float = 1e-5) -> float:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=10, help="steps of each length, and of the fall")

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Liakopoulos's column: wet sand drains at its foot by its weight, sucks itself together, and settles.
+"""Liakopoulos's column: wet sand drains at its foot under gravity, contracts by suction, and settles.
 
-A column of 1 m, at rest under the weight of its water, p = 0 everywhere, opens at its foot.  Its law of retention is
-one of the user's own; the skeleton feels chi p with chi the saturation.  Beside it the converged solution, of 400
+A column of 1 m, at rest under the weight of its water, p = 0 everywhere, is opened at its foot.  Its retention curve
+is a user's own.  The skeleton carries chi p with chi the saturation.  The reference is a converged solution with 400
 finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors, at 5, 10, 30 and 120 minutes: the largest of a pressure at five heights over the largest pressure then, and of
-the settlement and of the flow out of the foot.  On one process.
+Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, over the largest pressure at that
+time.  Others are errors of the settlement and of the outflow at the foot.  On one process.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def column(cells: int) -> mpm.Simulation:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--step", type=float, default=60.0, help="step up to 10 minutes, s; then three times as long")
@@ -85,7 +85,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
-    """Draw pressures over the height, and settlements over time, beside the converged ones."""
+    """Draw pressures over the height, and settlements over time, with the converged ones."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")

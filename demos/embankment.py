@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""A bund under water, raised in lifts on soft clay that settles as it drains.
+"""An embankment under water is built in lifts on soft clay, which consolidates.
 
-Half of it (x = 0 is a plane of symmetry): 6 m of clay, on which four lifts of 1 m with slopes of 1:2 are put, one
-every 90 days, then ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh) that comes onto the
-ground as it lies by then, and fills it up to its design level: what has settled is made up for.  Pressures are those
-in excess of the sea above, and weights are buoyant: the lifts' is a term in UFL, the clay's was in balance before.
-Where a lift comes to lie the ground is no open side any more; its slope and crest are.  On one process.
+Half of the section (x = 0 is a plane of symmetry): 6 m of clay, and four lifts of 1 m with slopes of 1:2, one every
+90 days, followed by ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh).  It is placed on the
+present ground and filled up to its design level, which makes up for the settlement.  Pressures are in excess of the sea
+above, and weights are buoyant.  The weight of the lifts is a term in UFL; the clay is in equilibrium with its own from
+the start.  A lift closes the drainage of the ground below, and its slope and crest are drained.  On one process.
 
-Check: at the end the clay's lowest points carry the weight of the lifts, what they make up for included: `carried` is
-the integral of their effective stress over that weight, 1 in balance.
+Check: at the end the lowest points of the clay carry the weight of the lifts with their additional fill.  `carried` is
+the integral of the effective stress there over that weight, 1 in equilibrium.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def lift(grid: mpm.Grid, k: int):
 
 @dataclass
 class Bund:
-    """What has been seen: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
+    """Histories: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
 
     frames: title, corners (n, 4, 2), m, and excess pressures (n,), Pa; carried: share of the lifts' weight that the
     lowest points carry at the end.
@@ -126,7 +126,7 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=6, help="steps between two lifts")

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""What accuracy costs: error against run time, material points beside finite elements, in one run.
+"""Error against run time, for material points and finite elements, in one run.
 
-Five cases with an exact or converged solution.  In each, cell size, points per cell, quadrature and
-coupling of the material points are varied, beside body-fitted finite elements on the same grid
-(Q1/DG0, the peer) and Taylor-Hood elements.  Time is that of the time loop, the least of `--repeat`
-runs; compile times are listed apart.  Truths are converged in space and in time.
+Five cases have an exact or converged solution.  In each, cell size, points per cell, quadrature and coupling of the
+material points vary.  The finite elements are body-fitted: Q1/DG0 on the same grid, and Taylor-Hood.  The time is the
+shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged in space
+and in time.
 
-* beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, usually in the first, and
-  that from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
+* beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, and from 0.1 s on.  The
+  reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
 * drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
 * terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
 * column: height of the soft column under its own weight, exact
@@ -124,7 +124,7 @@ def scene_runs(
 ) -> Iterator[tuple[str, str, Run]]:
     """Yield (method, setting, run) of a box whose top moves by `exact` (m); `width` cells wide, or -1: as high.
 
-    time: end (s) and the number of steps of the sweep over the cells; steps: those of the sweep over time.
+    time: end (s) and number of steps of the sweep over the cells; steps: numbers of steps of the sweep over time.
     """
 
     def points(n: int, m: int, rtol: float | None = None, **options) -> Run:
@@ -294,7 +294,7 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="cases to run")
     parser.add_argument("--quick", action="store_true", help="a few coarse runs of each case")

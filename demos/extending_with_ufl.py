@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Physics of your own in a few lines of UFL: columns, each beside its exact solution.
+"""Physics of your own in a few lines of UFL: columns, each with its exact solution.
 
-A column of 1 m between smooth walls stands on a floor (plane strain).  Each time something is added: a stored
-energy, fibres whose direction is stored on the points, a conductivity that depends on the deformation (twice), an
-elastic foundation, a source of fluid, a law with a state of its own, plastic flow, an equation that a stress solves, a
-return in numpy.  What a function takes is read from the names of its arguments; `materials/skeleton.py` and
-`materials/user_functions.py` of the package list them.
+A column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature: a stored energy,
+fibres with directions on the points, two conductivities that depend on the deformation, an elastic foundation, a source
+of fluid.  Others add a law with its own state, plastic flow, an implicit stress, and a return mapping in numpy.  The
+parameters of a function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the package
+list them.
 
 Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for
-energy and fibres, whose layers are stretched in the one step that they take; 3e-3 for both conductivities, 6e-4 for
-the foundation and 5e-4 for the source, which fall with the cell size; 1e-5 for the damage, whose top gives way a
-little; 1e-11 for plastic flow, the equation and the return.
+energy and fibres, with stretched layers in their single step; 3e-3 for both conductivities,
+6e-4 for the foundation and 5e-4 for the source.  They fall with the cell size.  The damage has 1e-5, because its top
+yields a little.  Plastic flow, the implicit stress and the return mapping have 1e-11.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> m
 
 @dataclass
 class Example:
-    """What a column gives, found (n,) and exact (n,), over the abscissa x (n,)."""
+    """Result of a column, found (n,) and exact (n,), over the abscissa x (n,)."""
 
     title: str
     xlabel: str
@@ -67,7 +67,7 @@ def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of what the cells hold (m), upwards, and the cells' pore pressures (Pa)."""
+    """Return the heights of the centroids in the cells (m), upwards, and the cells' pore pressures (Pa)."""
     cells = s.cells()
     order = np.argsort(cells.x[:, 1])
     return cells.x[order, 1], cells.pressure[order]
@@ -152,7 +152,7 @@ def of_strain(conductivity, J):
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Press water upwards through a column of two layers, of which the load squeezes the lower one more."""
+    """Press water upwards through a column of two layers; the load compresses the lower one more."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)
@@ -362,7 +362,7 @@ EXAMPLES = (energy, fibres, kozeny_carman, strain_law, springs, well, damage, pl
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height, a multiple of 4")
     o = parser.parse_args(argv)
@@ -377,7 +377,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, examples: list[Example]) -> None:
-    """Draw every example beside its exact solution."""
+    """Draw every example with its exact solution."""
     fig, axes = common.figure(5, 2, (6.5, 11))
     for ax, e in zip(axes.flat, examples, strict=True):
         ax.plot(e.x, e.exact, color="black", lw=1, label="exact")

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Stiff and extreme scenes: each converges, recovers or is refused, none is silently wrong.
+"""Stiff and extreme scenes: each converges, recovers or is refused, and none is silently wrong.
 
-Every scene is tiny, and one thing about it is extreme.  It ends in one of
+Every scene is tiny and has one extreme property.  It ends in one of
 
-* converged: within its family's bound of an exact solution, of finite elements of the same law, or of the
-  same scene at a moderate setting; both residuals and the fluid balance below 1e-8;
-* recovered: the same, after steps that were cut;
-* refused: with an error that says why; a scene that has no equilibrium must be refused;
-* warned: off by more than the bound, as the package has said in a warning;
-* wrong, nan or hung: a defect.  The exit status says whether there was none.
+* converged: within its family's bound of an exact solution, of finite elements, or of the same scene at a moderate
+  setting.  Both residuals and the fluid balance are below 1e-8;
+* recovered: the same, after cut steps;
+* refused: with an error that gives the reason; a scene without equilibrium must be refused;
+* warned: error above the bound, with a warning of the package;
+* wrong, nan or hung: a defect, which the exit status reports.
 
-An error is relative to the largest exact value, unless its family says otherwise.  The condition number is that
-of the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.
-On one process.
+An error is relative to the largest exact value, unless its family defines another one.  The condition number is that of
+the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On one
+process.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """What became of a case; worst residual and balance of its steps, iterations in all."""
+    """Outcome of a case; worst residual and balance of its steps, total iterations."""
 
     family: str
     setting: str
@@ -148,7 +148,7 @@ def table(head: list[str], rows: list[list]) -> str:
 
 
 def summary(rows: list[Row]) -> str:
-    """Return a line a family: what it shows, its bound, counts of the outcomes and worst figures."""
+    """Return a line for each family: subject, bound, counts of the outcomes and worst figures."""
     names = ("error", "residual", "balance", "condition")
     lines = []
     for name, f in FAMILIES.items():
@@ -202,7 +202,7 @@ def draw(out: Path, rows: list[Row]) -> None:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="four cases of each family, the first and last among them")

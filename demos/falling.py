@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A box slides, a ball rolls and another one bounces down an incline, beside what rigid ones do.
+"""A box slides, a ball rolls and another ball bounces down an incline: distances against rigid-body motion, energies.
 
-The incline, 30 degrees to the grid, is rough, mu = 0.3.  A rigid box slides down it by (sin b - mu cos b) g t^2 / 2, a
-disc, mu > tan b / 3, rolls by sin b g t^2 / 3.  Another one falls on it by its own radius: until it strikes it flies,
-then it bounces and turns.  Box and balls are stiff rubber, one body each that touches nothing but the incline.  What
-their weight gives is what they have in the end, but for what friction takes, and what waves in them lose.  Needs gmsh.
+The incline, 30 degrees to the grid, is rough, mu = 0.3.  A rigid box slides by (sin b - mu cos b) g t^2 / 2.  A rigid
+disc, mu > tan b / 3, rolls by sin b g t^2 / 3.  Another disc falls on the incline from a height of its own radius.
+It flies until the impact, then bounces and rotates.  Box and discs are stiff rubber.  Each is a single body that
+touches the incline only.  The work of gravity is the energy at the end, less friction and the loss to waves.  Needs
+gmsh.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Res
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=5, help="cells over a ball's radius")
     parser.add_argument("--dt", type=float, default=0.005, help="step, s")
@@ -101,7 +102,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the shapes on their way, the ways beside those of rigid bodies, and energies."""
+    """Draw the shapes in motion, their distances and the rigid ones, and energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)

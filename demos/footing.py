@@ -1,40 +1,39 @@
 # SPDX-License-Identifier: MIT
-"""A strip footing is pushed into saturated soil, as deep as it is wide: fast, at an intermediate rate and slowly.
+"""A strip footing is pushed into saturated soil by its width: fast, at an intermediate rate and slowly.
 
-Half of the footing, rough and rigid, is a given displacement of a part of the soil's top; the soil, a layer 2.5 B
-thick on rough rock, is Drucker and Prager's with cohesion c, weightless, and drains at its top beside the footing.
-v is the rate of the push, V = v B / c_v its ratio to that of consolidation, B the footing's width.
+Half of the footing, rough and rigid, is a prescribed displacement on a part of the soil's top.  The soil is a layer
+2.5 B thick on rough rock.  It follows Drucker and Prager's law with cohesion c, is weightless, and drains at its free
+top.  v is the rate of the push, V = v B / c_v its ratio to that of consolidation, B the footing's width.
 
-The box ends 8 B from the middle, by a smooth wall that lets no water through.  One that ends at 16 B changes no load
-by 1 %, at any depth and rate; the demo shows it, on fewer cells.  With a wall at 4 B drained loads are up to 8 % too
-large while the soil below yields, before the limit is reached.  The thickness of the layer matters: in plane strain the
-settlement of a thicker layer grows without bound, as its logarithm (5 B: loads down by 11 % at 0.1 B, 3 % at 0.5 B).
+The box ends 8 B from the middle at a smooth, impervious wall.  A wall at 16 B changes no load by 1 %, at any depth and
+rate; the demo shows it, on fewer cells.  With a wall at 4 B drained loads are up to 8 % too large while the soil below
+yields, before the limit is reached.  The thickness of the layer matters.  In plane strain the settlement of a thicker
+layer grows without bound, as its logarithm (5 B: loads down by 11 % at 0.1 B, 3 % at 0.5 B).
 
 Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c,
-N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Both are met by soil so stiff that it flows before
+N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  The limit loads use very stiff soil, which flows before
 the geometry changes, with --cells over the width and about twice as many.
 
-The soil that is pushed deep does not dilate: undrained its strength is s_u = xi c, and a base at depth D carries
-(1 + 0.27 sqrt(D/B)) times as much (fit to bounds of limit analysis, Salgado et al. 2004); drained its capacity
-at the surface lies between that of Davis's (1968) reduced friction and c N_c.
+For the deep push the soil does not dilate.  Its undrained strength is s_u = xi c.  A base at depth D carries
+(1 + 0.27 sqrt(D/B)) times as much (fit to bounds of limit analysis, Salgado et al. 2004).  Its drained capacity at the
+surface lies between that of Davis's (1968) reduced friction and c N_c.
 
-The undrained limit is met from below, at order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The last node that holds
-the footing carries half a cell beyond it, so an odd number of cells has the true width.  With 4, 8, 16 cells the last
-node lies at the edge, and the load is larger by that half cell on both sides.
+The undrained limit converges from below, with order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The last fixed node
+carries half a cell beyond it, so an odd number of cells has the true width.  With 4, 8, 16 cells the last node lies at
+the edge, and the load is larger by that half cell on both sides.
 
-In associated flow each place of a cell has to dilate with its own shear, but the cell has one mean dilatation: the
-load would go on rising (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  So where all
-soil of a cell flows, laws see half of the difference of the gradient from its mean: -1.0, +0.2, +0.8 % with 5, 9, 17
-cells.
+In associated flow each point of a cell must dilate with its own shear, but the cell has one mean dilatation.  The
+load would rise without limit (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  In fully yielding
+cells, laws therefore use half of the deviation of the gradient from its mean: -1.0, +0.2, +0.8 % with 5, 9, 17 cells.
 
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 
-With --graded cells grow by a tenth from one to the next, up to eight times, away from a fine box of 2 B x 0.75 B below
-the footing: a box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B whose cells are all fine.
+With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside of it, cells grow by a tenth from one to the
+next, up to eight times.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B with fine cells only.
 
-Soil whose flow dilates less than its friction has no one answer: bands of shear a cell wide jump from place to place,
-the more of them the finer the cells (Rudnicki and Rice 1975), and on fine grids step after step is cut.
---viscosity gives it a resistance to the rate of shear, small beside the cohesion: then there is one (Needleman 1988).
+With non-associated flow the answer is not unique.  Shear bands one cell wide jump from place to place, more
+so with finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a resistance to the
+shear rate, small compared with the cohesion, which makes the answer unique (Needleman 1988).
 """
 
 from __future__ import annotations
@@ -162,7 +161,7 @@ def push(
     rest
         Time of consolidation after the push, over B²/c_v.
     steps
-        Equal steps of the push; by default those of `STEP`.
+        Equal steps of the push; by default from `STEP`.
     circular
         A disc of the diameter B, not a strip.
     method
@@ -209,7 +208,7 @@ def push(
 
 
 def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
-    """Push the footing into very stiff soil; its loads are over those of the theory.
+    """Push the footing into very stiff soil; its loads are relative to theory.
 
     box, graded: see `push`; by default that of `LIMITS_OF`, of equal cells.
     """
@@ -229,7 +228,7 @@ def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, gra
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
     parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
@@ -274,7 +273,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def of_many_sizes(cells: int, folder: Path) -> dict:
-    """Print and draw the undrained limit load in a large box of graded cells beside a small one of equal cells.
+    """Print and draw the undrained limit load in a large box of graded cells and in a small one of equal cells.
 
     Returns it with the points and the seconds of processor time.
     """
@@ -321,7 +320,7 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
 
 
 def effort(cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0) -> dict:
-    """Push at the intermediate rate in equal steps; print what they took and return it.
+    """Push at the intermediate rate in equal steps; print their cost and return it.
 
     width: of half the soil, over B; viscosity: see `viscous`.
     """
@@ -352,7 +351,7 @@ def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
 
 
 def twice_the_box(cells: int, depth: float) -> dict[str, float]:
-    """Print by how much loads change at most in a box twice as wide, over those in `BOX` at that depth; return it."""
+    """Print the largest change of load in a box twice as wide, over the load in `BOX` at that depth; return it."""
     out = {}
     for name, rate in RATES.items():
         near, far = (push(SOIL, cells, depth, rate, box=(wide * BOX[0], BOX[1])) for wide in (1, 2))
@@ -365,7 +364,7 @@ def twice_the_box(cells: int, depth: float) -> dict[str, float]:
 
 
 def report(runs: dict[str, Push]) -> dict:
-    """Print what the pushes were like and return it."""
+    """Print the results of the pushes and return them."""
     out = {}
     for name, run in runs.items():
         out[name] = found = {
@@ -457,7 +456,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
 
 
 def draw_loads(ax, runs: dict[str, Push]) -> None:
-    """Draw load over settlement at all rates beside the theory."""
+    """Draw load over settlement at all rates, and the theory."""
     for (name, each), colour in zip(runs.items(), COLOURS, strict=True):
         upto = each.pushed + 1
         ax.plot(each.settlement[:upto], each.load[:upto], color=colour, label=f"{name}, V = {RATES[name]:g}")
@@ -477,7 +476,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
 
 
 def animate(out: Path, run: Push) -> None:
-    """Draw the push and what follows as an animation."""
+    """Draw the push and the consolidation as an animation."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     fig, ((ax,),) = common.figure(1, 1, (6.4, 3.9))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""A tissue as a picture shows it: grey values are stiffness, black are holes; compressed by a plate, and drained.
+"""Tissue from an image: grey values are stiffness, black pixels are holes; compressed by a plate, and drained.
 
-The picture is made here, by smoothed noise; one from a scanner, as an array, does as well.  Each pixel is a cell of
-the grid.  `mpm.shape` keeps what is not black, and the law's constants are functions of place that look the grey value
-up: from black to white tissue becomes ten times as stiff and less permeable.  A rigid plate that lets water through
-presses it between smooth walls by an eighth of its height; its holes are sealed.  On one process.
+The image is smoothed noise, made here; a scanner's array works as well.  Each pixel is a cell of the grid.
+`mpm.shape` keeps all pixels that are not black.  The constants of the law are functions of position that look up the
+grey value. From black to white, tissue becomes ten times as stiff and less permeable.  A rigid permeable plate
+compresses it between smooth walls by an eighth of its height.  The holes are no-flow.  On one process.
 
-Checks: `modulus`, stress over strain of the drained tissue under a small load, over that of Taylor-Hood elements of
-which each pixel is one (holes are elements of a millionth of the stiffness), less 1; and `drained`, the settlement of
-the wet tissue in the end over that of dry tissue, less 1.  Both fall with the pixels' size.
+Checks: `modulus` is stress over strain of the drained tissue under a small load, relative to Taylor-Hood elements.
+These have one element for each pixel, and a millionth of the stiffness in holes.  `drained` is the final settlement of
+the wet tissue relative to dry tissue.  Both errors fall with the size of the pixels.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TOP = ((0.0, 0.999 * EDGE), (EDGE, EDGE))  # region of the upper edge: holes hav
 
 
 def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
-    """Return grey values (x, y), 0 to 1; what does not hang together with the largest part is a hole."""
+    """Return grey values (x, y), 0 to 1; all but the largest connected part are holes."""
     noise = np.random.default_rng(seed).standard_normal((pixels, pixels))
     smooth = gaussian_filter(noise, pixels / 16, mode="reflect")
     smooth += 3 * smooth.std() * np.exp(-np.arange(pixels)[::-1] / (0.06 * pixels))  # a skin, for the plate
@@ -43,7 +43,7 @@ def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Tissue:
-    """Tissue of grey values (x, y); those below HOLES are holes."""
+    """Tissue of grey values (x, y); values below HOLES are holes."""
 
     grey: NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class Tissue:
 
 @dataclass
 class Outcome:
-    """What is seen: times, s, settlements over EDGE, and highest pressures, Pa.
+    """Histories: times, s, settlements over EDGE, and highest pressures, Pa.
 
     frames: time, corners, pressures and grey values of the points; drained: settlement of dry tissue over EDGE.
     """
@@ -136,7 +136,7 @@ def run(tissue: Tissue, rtol: float) -> Outcome:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--pixels", type=int, default=48, help="over the edge of the picture")
     parser.add_argument("--seed", type=int, default=9, help="of the picture")

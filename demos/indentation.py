@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A rigid cylinder is pressed into a wet gel, held there, and the force on it relaxes as the gel drains.
+"""A rigid cylinder is pressed into a wet gel and held, and its force relaxes as the gel drains.
 
-Plane strain; half of the gel, 5 m wide and high, on a smooth base.  It drains at its side, far from the
-cylinder, which goes down at once.
+Plane strain; half of the gel, 5 m wide and high, on a smooth base.  It drains at its side, far from the cylinder, which
+moves down at once.
 
-* At once no water moves and the gel is incompressible.  The pressure under the cylinder is Hertz's,
+* Immediately no water flows and the gel is incompressible.  The pressure under the cylinder is Hertz's,
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
-  E* = 4 G of the undrained gel.  Of a layer this holds for the force F that it bears.
-* In the end the pressure of the water is gone.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel, and
-  the force that of a dry scene, which is run beside it.
+  E* = 4 G of the undrained gel.  In a layer this holds for the actual force F.
+* Finally the pore pressure has dissipated.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
+  force equals that of a dry scene, which the demo also runs.
 """
 
 from __future__ import annotations
@@ -85,8 +85,10 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 
 @dataclass
 class Pressed:
-    """A run: contacts at once and, if wet, in the end; forces (N/m) at once and at `TIMES`; corners, pore pressures and
-    cylinder at once; of the fluid balance the worst, and cut steps.
+    """A run.
+
+    contacts: at once and, if wet, in the end; forces: N/m, at once and at `TIMES`; frame: corners, pore pressures and
+    cylinder at once; balance: worst error of the fluid balance; cuts: cut steps.
     """
 
     contacts: list[Contact]
@@ -113,7 +115,7 @@ def pressed(cells: int, wet: bool) -> Pressed:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact")
     o = parser.parse_args(argv)
@@ -137,7 +139,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
-    """Draw pore pressures at once, pressures under the cylinder beside Hertz's, and the force in time."""
+    """Draw pore pressures at once, pressures under the cylinder with Hertz's, and the force in time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")

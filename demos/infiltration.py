@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Water soaks into soil that is not saturated, beside exact and converged solutions.
+"""Water infiltrates unsaturated soil, with exact and converged solutions.
 
-Left: rain on exponential soil (`Gardner`) above a water table, a tenth of what it conducts for ever, nine tenths from
-t = 0 on; heads beside the series of Srivastava and Yeh (1991).  Right: a wet surface above dry soil (`VanGenuchten`),
-the second case of Celia, Bouloutas and Zarba (1990), beside the converged solution of Richards' equation, and beside
-finite elements (Q1/DG0) on the same cells with the same steps.
+Left: rain on exponential soil (`Gardner`) above a water table.  The rain is a tenth of the conductivity until t = 0,
+and nine tenths after; heads against the series of Srivastava and Yeh (1991).  Right: a wet surface above dry soil
+(`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990), against a converged solution of Richards'
+equation, and against finite elements (Q1/DG0) on the same cells with the same steps.
 
-Errors: of the rain the largest of a head at 1, 6 and 12 h over the largest head then, of the front the place of
--5 m and the water taken in, at 6 and 12 h, of material points and of elements.  On one process.
+Errors: for the rain, the largest error of a head at 1, 6 and 12 h over the largest head at that time.  For the front,
+the position of the head -5 m and the infiltrated water, at 6 and 12 h, of material points and of elements.  On one
+process.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--rain-step", type=float, default=600.0, help="step under rain, s")
@@ -139,7 +140,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heads: list, depths: list) -> None:
-    """Draw heads over heights beside the series, and over depths with the converged places of the front."""
+    """Draw heads over heights with the series, and over depths with the converged positions of the front."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):

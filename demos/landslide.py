@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, settles under
-its weight without inertia; its factor of safety is 1.4.  Then its strength is divided by 1.6, at once.  With inertia it
-slides, faster and faster until its shape bears what is left, and on until friction has taken its speed.  Without, as in
-the demo `slope`, a viscous stress lets it go from one equilibrium to the next: it ends where the first shape is that
-bears, so it goes less far.  What the weight gives up is lost to friction, but for what is elastic: energies balance.
+A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  It
+settles under its weight without inertia; its factor of safety is 1.4.  Then its strength is divided by 1.6, at once.
+
+With inertia it accelerates until its new shape is stable, and moves on until friction stops it.  Without inertia, as
+in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then stops at
+the first stable shape, so its run-out is shorter.  Energies balance: friction dissipates the work of gravity, except
+for the elastic part.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--dt", type=float, default=0.05, help="step of the slide, s")

@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Mandel's slab: squeezed between rigid plates, its middle gains pressure before it drains.
+"""Mandel's slab: compressed between rigid plates, with a rise of pressure in its middle before it drains.
 
-A saturated slab between rigid, smooth, sealed plates takes a force in the first step.  Its free sides
-drain and soften first, so the plates load the middle more, and the pressure there rises above its first
-value p0 = force / (2a): the Mandel-Cryer effect, which only a two-way coupling has.  By symmetry a
-quarter is computed, a = 1 m wide and 1 m high, in plane strain, nu = 0.2, water and grains
-incompressible; the mean strain is 1e-5, so small strain is exact enough.  T = c t / a² is the reduced
-time, c = kappa (K + 4G/3).  The solution is linear over the height, which needs few cells.  Source:
-Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
+A saturated slab between rigid, smooth, impervious plates takes a force in the first step.  Its free sides drain and
+soften first, so the plates load the middle more.  The pressure there rises above its first value p0 = force / (2a):
+the Mandel-Cryer effect, which only a two-way coupling has.  By symmetry a quarter is computed, a = 1 m wide and 1 m
+high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain theory is
+accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  The solution is linear over the height, which
+needs few cells.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
 
-Errors: `p_0.01` to `p_1`, the largest over the cells of |p - exact| a / force at T = 0.01, 0.1, 0.5 and
-1, a cell's pressure compared at the cell's centroid; `p_max`, the relative error of the highest pressure
-in the innermost cell, reached at T = 0.07, and, stricter, `p_rise`, that of its rise above p0;
-`settlement`, the largest relative error of the plate's at those times.  Most of it is that of the
-cells: it falls with the square of their size.
+Errors:
+
+* `p_0.01` to `p_1`: the largest over the cells of |p - exact| a / force at T = 0.01, 0.1, 0.5 and 1, at the centroid of
+  the cell;
+* `p_max`: of the highest pressure in the innermost cell, at T = 0.07, relative;
+* `p_rise`, stricter: of its rise above p0;
+* `settlement`: the largest relative error of the plate's settlement at these times.
+
+Most of the error is spatial: it falls with the square of the cell size.
 """
 
 from __future__ import annotations
@@ -38,9 +41,9 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 
 @dataclass
 class Outcome:
-    """What a run gives, an entry a step: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m) of the top.
+    """Results of a run, an entry for each step: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m).
 
-    The settlements are those of eleven places from the middle to the side.
+    Settlements of the top are given at eleven places from the middle to the side.
     """
 
     time: list[float] = field(default_factory=list)
@@ -106,7 +109,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width, four times those over the height")
     parser.add_argument("--steps", type=int, default=30, help="equal steps to each of T = 0.01, 0.1, 0.5, 1")
@@ -124,7 +127,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the width, and in the middle over time, beside the exact curves."""
+    """Draw the pressure over the width, and in the middle over time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     unit, scale, x = WIDTH**2 / EXACT.cv, FORCE / WIDTH, np.linspace(0, WIDTH, 201)
     for i, k in enumerate(map(out.at, SAMPLES)):

@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, a rigid cylinder, is pushed sideways through clay, deep below the surface.
 
-The clay is von Mises's, undrained, of strength s_u in plane strain.  The bar is wished in place and pushed until the
+The clay is von Mises's, undrained, of strength s_u in plane strain.  The bar starts in place and is pushed until the
 clay flows all around it.  Then its resistance is that of Randolph and Houlsby (1984), for adhesion alpha s_u on it,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-Half of the clay, a block eight diameters wide and high, lies between smooth walls under a pressure on its top that
-keeps the gap behind the bar closed; as that settles the clay, it loads the bar downwards first.  In a narrower block
-the bar resists less: in one four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 if it is rough.
+Half of the clay, a block eight diameters wide and high, lies between smooth walls.  A pressure on its top keeps the gap
+behind the bar closed.  The pressure settles the clay, so it first loads the bar downwards.  In a narrower block the
+resistance is lower: four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 for a rough bar.
 
-Clay ahead of the bar parts, and stretches exponentially, by about e^4 over a diameter.  So clay is seeded anew around
-the bar after each quarter of a diameter, under the stresses that are there (remeshing and interpolation: Hu and
-Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22): all that this clay remembers.  For a step or two N is lower
-then.  Errors are those of its mean over the last quarters of these ways, `spread` is by how much it varies in them.
+Clay ahead of the bar divides and stretches exponentially, by about e^4 over a diameter.  The clay is therefore seeded
+again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu and
+Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  For a step or two N is
+lower then.  Errors refer to the mean of N over the last part of each quarter, and `spread` is its variation there.
 
-Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v, with water of the same pressure
-on top, so that it begins without effective stress.  It is seeded once: domains that are narrower ahead of the bar at
-first, by what they will stretch, end as wide as the others.
+Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v.  Water of the same pressure
+stands on top, so the clay starts without effective stress.  It is seeded once.  The domains ahead of the bar are
+narrower at first, by their later stretch, and end as wide as the others.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
 class Push:
     """A push, a step each: depths over D, resistances over s_u D, whether they count, and excess pressures over s_u.
 
-    frame: corners (n, 4, 2), m, how far points have moved over how far the bar has, since the clay was seeded (n,), or
-    excess pressures of wet clay over s_u (n,), and what the bar fills (m, 4, 2), m, at the end.
+    frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
+    motion of the points over that of the bar since the clay was seeded, or the excess pressure of wet clay over s_u.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -188,7 +188,7 @@ def push_wet(rate: float, cells: int, depth: float) -> Push:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
@@ -250,7 +250,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
 
 
 def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the end of a push, and what its frame shows."""
+    """Draw the end of a push with the field of its frame."""
     corners, values, bar = run.frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""A saturated cantilever under a load that stays: a poroelastic beam of 1 m x 0.3 m.
+"""A poroelastic beam of 1 m x 0.3 m: a saturated cantilever under a constant load.
 
-A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on, raised
-linearly over the ramp and then held.  Its ends are permeable, its long sides sealed.  It is in plane
-strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water
-carries part of the load; as it drains, the beam sags by a third of its length.  Shown beside it:
-Euler-Bernoulli's small-strain beam without water, and (--reference) a body-fitted Taylor-Hood
-finite element solution of the same finite-strain Biot problem, in steps of a quarter of --dt.
+A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load rises linearly
+over the ramp and then stays.  The ends of the beam are permeable, and its long sides are no-flow.  It is in plane
+strain, or 0.1 m deep between smooth walls (--dim 3), which is equivalent.  At first the pore water carries a part of
+the load.  The beam drains and sags by a third of its length.  Two other solutions are shown.  One is
+Euler-Bernoulli's small-strain beam without water.  The other (--reference) is a body-fitted Taylor-Hood finite element
+solution of the same finite-strain Biot problem, in steps of a quarter of --dt.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def arguments(argv: list[str] | None = None) -> Namespace:
 
 
 def physics(o: Namespace, dim: int = 2) -> dict:
-    """Return what material points and finite elements share: boundary conditions and fluid."""
+    """Return the common boundary conditions and fluid of material points and finite elements."""
     inner = [np.inf] * (dim - 1)
     load = mpm.Traction(
         "top",
@@ -116,14 +116,14 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
 
 
 def output_times(o: Namespace) -> dict:
-    """Return the steps and output times for `run`: equal steps, or those of TIMES with steps by their error."""
+    """Return the steps and output times for `run`: equal steps, or TIMES with adaptive steps."""
     if o.rtol is None:
         return {"dt": o.dt}
     return {"rtol": o.rtol, "t_eval": [t for t in TIMES if t <= o.t_end]}
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     o = arguments(argv)
     try:
         simulation, bottom = scene(o)
@@ -194,7 +194,7 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
 
 
 def report(o: Namespace, result: mpm.Result, fem) -> None:
-    """Print the tip's deflection, beside the reference where there is one."""
+    """Print the tip's deflection, and the reference if there is one."""
     rows = [["tip: t (s)", "u_x (m)", "u_y (m)", *(["FEM (m)", "difference"] if fem else [])]]
     every = max(1, len(result.t) // 12)
     for k in sorted({*range(1, min(4, len(result.t))), *range(every, len(result.t), every), len(result.t) - 1}):
@@ -249,7 +249,7 @@ def draw_pressure(o: Namespace, snapshots: list) -> None:
 
 
 def draw_deflection(o: Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
-    """Draw the beam's axis at several times beside Euler-Bernoulli and the finite elements."""
+    """Draw the beam's axis at several times, with Euler-Bernoulli and the finite elements."""
     import matplotlib
 
     fig, ((ax,),) = common.figure(1, 1, (8, 5))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Why domains of points are integrated exactly: the drained beam's tip against the number of load steps.
+"""Exact integration of particle domains: the drained beam's tip against the number of load steps.
 
-The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material
-is elastic, so the answer must not depend on n.  Integrated over the exact pieces of the points'
-domains it does not; integrated at the points, as standard MPM does, it drifts with every cell that a
-point crosses.  The finite element reference takes the load in ten steps.
+The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material is elastic, so
+the answer must not depend on n.  It does not with integration over the exact pieces of the domains.  With integration
+at the points, as in standard MPM, it drifts with every cell that a point crosses.  The finite element reference takes
+the load in ten steps.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def options(h: float, steps: int, quadrature: str = "domain") -> Namespace:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--steps", type=int, nargs="+", default=[10, 20, 40, 80, 160], help="numbers of load steps")

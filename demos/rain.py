@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Rain on a long slope whose suction holds it: pore pressures and the factor of safety in time, beside exact ends.
+"""Rain on a long slope that suction stabilises: pore pressures and the factor of safety in time, with exact limits.
 
-A slope of 35 degrees, far longer than deep: all that happens depends on the way across it.  A column of it stands on a
-water table 5 m below the surface, with the part of gravity that acts across the slope.  It rests, and then rain falls
-straight down, nine tenths of what the soil conducts, until the flow is steady.  At a depth d (vertical)
+A slope of 35 degrees is much longer than deep, so the problem is one-dimensional across it.  A column stands on a water
+table 5 m below the surface, under the component of gravity across the slope.  It starts at rest.  Then rain falls
+vertically, nine tenths of the conductivity, until the flow is steady.  At a depth d (vertical)
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
 
-by the suction stress chi s of Bishop, with a unit weight gamma that stays.  At both ends of the storm this is exact for
+with the suction stress chi s of Bishop and a constant unit weight gamma.  Before and after the storm this is exact for
 exponential soil: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), z above the table.
 
-Source: Lu and Godt (2008) for flow along the vertical; across the slope its gravity is that of the slope.  Errors: the
-largest of FS at 1, 2, 3 and 5 m at rest and at the end.  On one process.
+Source: Lu and Godt (2008) for vertical flow; across the slope, gravity is its component.  Errors: the largest error
+of FS at 1, 2, 3 and 5 m, at rest and at the end.  On one process.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells across the slope")
     parser.add_argument("--step", type=float, default=1800.0, help="step in the first two days, s")
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list) -> None:
-    """Draw heads and factors of safety over the depth, beside the exact ones at rest and in steady rain."""
+    """Draw heads and factors of safety over the depth, with the exact ones at rest and in steady rain."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for days, depth, head, felt in curves:
         left.plot(head, depth, lw=1.4, label=f"{days:g} d")

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
 """A rigid retaining wall tilts about its toe, away from the sand or into it: active and passive pressure.
 
-The sand carries a surcharge q beside which its weight does not count; phi = psi = 30 degrees.  It lies on a rough
-floor, and rubs on the wall with the angle delta.  Pressures on the wall grow or fall until a wedge of the sand flows:
-to K q, normal to the wall.  With c cot(phi) added to both, so that cohesion does not count,
+The sand carries a surcharge q and is weightless; phi = psi = 30 degrees.  It lies on a rough floor, and the friction
+angle of the wall is delta.  The wall tilts until a wedge of the sand flows, at the pressure K q, normal to the wall.
+With c cot(phi) added to both, which removes the effect of cohesion,
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
 the upper sign passive: a zone at the wall, a fan about its crest and Rankine's zone (Prandtl, Sokolovskii).  Without
-friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the worst plane one.
+friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the critical plane one.
 
-The moment about the toe, which does the work, gives K as well.  A wall that tilts opens no gap at its toe.  One that
-slides does, and bears nothing there: the last of ten cells misses a tenth of the active thrust.  The sand is stiff:
-tilted two and a half times as far, the active thrust rises by 2.5 to 3 %.
+The moment about the toe is conjugate to the rotation and gives K as well.  A tilting wall opens no gap at its toe.  A
+translating wall opens one and carries nothing there: the last of ten cells misses a tenth of the active thrust.  The
+sand is stiff: at two and a half times the tilt, the active thrust rises by 2.5 to 3 %.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def coulomb(delta: float, way: int) -> float:
 
 
 def slip_line(delta: float, way: int) -> np.ndarray:
-    """Return the edge (n, 2), m, of what flows, from the toe to the surface."""
+    """Return the edge (n, 2), m, of the flowing sand, from the toe to the surface."""
     p, d = np.radians([PHI, delta])
     fan, rankine = (np.arcsin(np.sin(d) / np.sin(p)) + way * d) / 2, np.pi / 4 - way * p / 2
     at_wall, apex = np.pi / 2 - rankine - fan, np.pi / 2 - way * p
@@ -92,7 +92,7 @@ def tilted(name: str, delta: float, cells: int) -> Tilted:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the height of the wall")
     parser.add_argument("--delta", nargs="*", type=float, default=[0, 15], help="friction angles of the wall, degrees")
@@ -118,7 +118,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[tuple[str, float], Tilted]) -> None:
-    """Draw what flows, with its exact edge, and K as the wall tilts."""
+    """Draw the flowing sand with its exact edge, and K as the wall tilts."""
     fig, axes = common.figure(len(runs), 2, (12, 2.5 * len(runs)))
     for (left, right), ((name, delta), run) in zip(axes, runs.items(), strict=True):
         corners, strain, wall = run.frame

@@ -3,13 +3,15 @@
 #
 # Installs what is missing (on Debian, as root or with sudo) and runs demos/DEMO.py; without a name,
 # the poroelastic beam. With -n on so many processes, by mpirun. ARGUMENTS: bash demos/run.sh DEMO --help.
+# short/NAME is a short example; its files go to out/short. `reference` makes the pages of the reference, `notebooks`
+# those of the tutorial and of three examples; both need pip, and take an environment of their own.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../.ci/setup.sh"
 
 # The names of the demos, and the first line of what each says of itself.
 demos() {
     (cd "$root/demos" && awk 'FNR == 2 && FILENAME != "common.py" {
-        sub(/\.py$/, "", FILENAME); gsub(/"""/, ""); printf "    %-20s%s\n", FILENAME, $0 }' *.py)
+        sub(/\.py$/, "", FILENAME); gsub(/"""/, ""); printf "    %-24s%s\n", FILENAME, $0 }' *.py short/*.py)
 }
 
 case ${1-} in
@@ -18,6 +20,9 @@ case ${1-} in
         printf '\nDemos:\n\n'
         demos
         exit ;;
+esac
+case ${1-} in
+    reference | notebooks) exec bash "$root/demos/reference/build.sh" "$@" ;;
 esac
 processes=
 if [ "${1-}" = -n ]; then
@@ -37,8 +42,12 @@ if [ ! -f "$root/demos/$demo.py" ] || [ "$demo" = common ]; then
     exit 2
 fi
 
-[ "$demo" != embankment ] || modules+=(gmsh)
+case $demo in
+    embankment) modules+=(gmsh) ;;
+    short/*) modules+=(gmsh h5py pandas) ;;
+esac
 setup
+case $demo in short/*) mkdir -p "$root/out/short" && cd "$root/out/short" ;; esac
 run=("$python" "$root/demos/$demo.py")
 if [ -n "$processes" ]; then
     command -v mpirun >/dev/null || { say "mpirun is missing: on Debian, apt-get install openmpi-bin"; exit 1; }

@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""What a step costs: time of each part, memory and messages against the number of material points and processes.
+"""Cost of a step: time of each part, memory and messages against the number of material points and processes.
 
-Two saturated bodies that creep through the grid: the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
-background box that is six times as large), and a cube of 1 m that is sheared and pressed in 3D (multigrid).  Every
-run is a process of its own, or several under mpirun (--processes 1 2).  After a first step, which compiles and
-fills the caches, steps are taken one by one; the fastest counts, since other work on the machine only adds.  Time is
-processor time, on several processes the most of any, in which it waits for the others too; it is shared among the
-parts as the clock's.  Memory is the peak since the start of the process, libraries and compiler included.  Started
-under mpirun itself, all runs share its processes, and memory is the peak so far.
+Two saturated bodies move slowly through the grid.  One is the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
+background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Every run is
+its own process, or several under mpirun (--processes 1 2).  The first step compiles and fills the caches.  Then single
+steps are measured, and the fastest counts, since other work on the machine only adds.  Time is processor time, shared
+among the parts in proportion to the clock.  On several processes it is the largest of all, including waits.  Memory is
+the peak since the start of the process, with libraries and compiler.  Under mpirun itself all runs share its processes,
+and memory is the peak so far.
 
-The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the
-sizes; the memory's slope, `kB a point`, is that of all sizes, by least squares of relative errors.  Runs on several
-processes also say how even the work is (`imbalance`: the most pieces that a process has over the mean) and what
-travels in a step, most of any process: `exchange` is what the package sends (pieces, corners, points), `solvers` what
-PETSc counts in set-up and solution of its Krylov solvers; MUMPS's and dolfinx's own messages are not counted.
+The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the sizes.
+The memory's slope, `kB a point`, is over all sizes, by least squares of relative errors.  Runs on several processes
+also print the load balance (`imbalance`: the most pieces of a process over the mean) and the traffic of a step, the
+largest of all processes.  `exchange` is the package's own (pieces, corners, points).  `solvers` is PETSc's count in
+set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
 
-With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P
-processes,
+With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
 
     T = e + a n / P + b H + c log2 P,
 
-a fixed cost, work of the points (of a run, times its imbalance), halo, and messages whose size does not matter; all
->= 0, by least squares of relative errors.  H is how many points lie along the faces that a process shares with
-others, where a cube is halved again and again.  Runs on more processes than the machine has processors count for
-messages only.  In 2D the solvers are left out: factors do not cost n / P.
+a fixed cost, work of the points (of a run, times its imbalance), halo, and messages of any size.  All terms are >= 0,
+by least squares of relative errors.  H is the number of points along the faces between processes, for a cube that is
+halved repeatedly.  Runs on more processes than processors count for messages only.  In 2D the solvers are left out:
+the cost of factorisations is not n / P.
 """
 
 from __future__ import annotations
@@ -126,7 +125,7 @@ def measure(dim: int, points: float) -> dict:
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
-    """Return what `measure` does in a process of its own, or in several."""
+    """Return the result of `measure` in its own process, or in several."""
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
@@ -200,7 +199,7 @@ def by_part(rows: list[dict], found: dict[str, float]) -> str:
 
 
 def by_processes(rows: list[dict]) -> str:
-    """Return time, memory, imbalance and what a process sends in a step as a Markdown table."""
+    """Return time, memory, imbalance and traffic of a step as a Markdown table."""
     columns = {
         "points": "points",
         "processes": "processes",
@@ -218,7 +217,7 @@ def by_processes(rows: list[dict]) -> str:
 
 
 def prediction(model: dict[str, float], dim: int) -> str:
-    """Return the cost model, and what it says of many processes."""
+    """Return the cost model, and its prediction for many processes."""
     form = f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} H + {model['c']:.2g} log2 P"
     lines = [f"{dim}D: T = {form} s, within {100 * model['worst']:.0f} % of the runs"]
     for share in (1e4, 1e5):
@@ -249,7 +248,7 @@ def draw(out: Path, rows: list[dict]) -> None:
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
-    """Draw the parts that take longest, and what a time and a memory that go with the points would be."""
+    """Draw the longest parts, and time and memory in proportion to the points."""
     n, found = np.array([row["points"] for row in rows]), exponents(rows)
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"
@@ -261,7 +260,7 @@ def draw_parts(left, right, rows: list[dict]) -> None:
 
 
 def write(out: Path, rows: list[dict]) -> dict:
-    """Write tables and pictures, print what they say; return exponents and cost models, by dimension."""
+    """Write tables and pictures, print them; return exponents and cost models, by dimension."""
     common.write_csv(out / "scaling.csv", rows[0], (row.values() for row in rows))
     text, found = [], {}
     for dim in sorted({row["dim"] for row in rows}):
@@ -287,7 +286,7 @@ def write(out: Path, rows: list[dict]) -> dict:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--dims", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="dimensions")

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A soft column sinks to less than half its height under its own weight.
+"""A soft column settles to less than half its height under its own weight.
 
-A dry column of 50 m between smooth walls, E = 10 kPa, nu = 0, 80 kg/m³: gravity, raised to 10 m/s² in equal
-steps, compresses it to 24.06 m, its foot to 0.3 of its length, so that points cross many cells.  The
-first Piola-Kirchhoff stress at the reference height Y carries what lies above, P = -rho0 g (l0 - Y), and
-in a column that keeps its width it is Cauchy's stress; Hencky's law gives the stretch by Lambert's W.
-Source: the column of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as
-stiff.  On one process.
+A dry column of 50 m stands between smooth walls, E = 10 kPa, nu = 0, 80 kg/m³.  Gravity, raised to 10 m/s² in equal
+steps, compresses it to 24.06 m, and its foot to 0.3 of its length, so points cross many cells.  The first
+Piola-Kirchhoff stress at the reference height Y carries the weight above, P = -rho0 g (l0 - Y).  In a column of
+constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lambert's W.  Source: the column of AMPLE
+(Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On one process.
 
-Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0),
-and the relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the
-initial height, 4.4e-4 with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points
-instead of over the pieces of their domains: its error stays at some 8 % whatever the cells.
+Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0), and the
+relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the initial height, 4.4e-4
+with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points instead of over the pieces of their
+domains.  Its error stays at some 8 % with any number of cells.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=64, help="cells over the first height")
     parser.add_argument("--steps", type=int, default=40, help="equal steps of gravity")
@@ -90,7 +89,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome, rival: Outcome) -> None:
-    """Draw the stress over the present height beside the exact curve and that of standard MPM."""
+    """Draw the stress over the present height, with the exact curve and that of standard MPM."""
     fig, ((ax,),) = common.figure(1, 1, (6.5, 5))
     Y = np.linspace(0, EXACT.l0, 201)
     ax.plot(EXACT.stress(Y) / 1e3, EXACT.position(Y), color="black", lw=1, label="exact")

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""A wave comes up from the ground into a soft layer: amplification at its surface beside the exact one.
+"""A shear wave rises from the ground into a soft layer: amplification at its surface against the exact one.
 
-A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s, which is cut off by a quiet base 5 m below.  A pulse
-of shear comes in through the base; what comes back from layer and surface leaves through it.  Sides are held along the
-vertical: the layer goes on alike.  Spectra of the surface over twice those of the incoming wave, which is what a free
-surface of the ground alone would have, are
+A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  An absorbing base 5 m below truncates the ground.
+A shear pulse enters through the base, and reflections from layer and surface leave through it.  The sides have no
+vertical displacement, as in an infinite layer.  The reference is twice the incoming wave, the motion of a free
+surface of the ground alone.  The spectrum of the surface over this reference is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
-c and c_g of the layer and the ground.  The work of the wave, and that against the base, are energies; they balance.
+with c and c_g of the layer and the ground.  The work of the wave and the work on the base enter the energy balance.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def exact(f: np.ndarray) -> np.ndarray:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the layer, even")
     parser.add_argument("--steps", type=int, default=500, help="steps of the run")

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Factor of safety of a slope, and its run-out when it loses more strength than that.
+"""Factor of safety of a slope, and its run-out after a larger loss of strength.
 
 A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil: phi = 20 degrees, c / (gamma H) = 0.05, no dilation.
 
-1. By what may c and tan(phi) be divided?  `mpm.factor_of_safety` weakens the slope at rest and looks whether what its
-   strength does not bear dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
+1. By how much may c and tan(phi) be divided?  `mpm.factor_of_safety` weakens the slope at rest, and checks if the
+   excess over the strength dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
    Lane 1999).
-2. The strength is divided by 1.6 at once, in soil with the viscosity eta: the slope slides until it has found another
-   shape, which it is just strong enough for: its factor of safety is then one, to a tenth.
+2. The strength is divided by 1.6 at once, in soil with the viscosity eta.  The slope slides until its new shape is
+   just stable: its factor of safety is then one, to a tenth.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--steps", type=int, default=40, help="steps of the slide")

@@ -1,28 +1,27 @@
 # SPDX-License-Identifier: MIT
 """A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
 
-A bank of saturated soil, 10 m high and as long on a rough floor (half of it, x = 0 is a plane of symmetry), stands
-with a vertical side under water.  Pressures are those in excess of the water outside and the weight is the
-buoyant one, gamma' = (1 - n) (rho_s - rho_w) g, given as a term in UFL.  Inertia is left out.  On one process.
+A bank of saturated soil, 10 m high and as long on a rough floor, stands with a vertical side under water.  Half of it
+is computed, x = 0 is a plane of symmetry.  Pressures are in excess of the water outside.  The weight is buoyant,
+gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On one process.
 
-1. How weak may it be?  Without friction and sealed, the strength c is lowered by 1 % a step.  A vertical side of
-   height H stands while gamma' H / c < 3.78 (limit analysis has it between 3.76 and 3.79: Pastor, Thai and
-   Francescato 2000; the best circle gives 3.83: Fellenius 1927).  The bank has failed where its crest settles
-   20 times as much in a step as at first; 10 or 40 times move that by 1 %.  With 10 and 20 cells over the height it
-   fails at 3.93 and 3.85, 3.9 and 1.9 % too late: first order in the cell size; extrapolated to none, at 3.78.
-2. What comes then?  With friction the bank, consolidated, loses its cohesion within T = 10 minutes, far less than
-   water needs to leave.  It slumps, its crest riding on what flows: the water takes more than half the weight of
-   what comes to lie before the toe.  At rest the bank reaches twice as far as before; then the excess pressure
-   drains.  In the end its slope is 23.5 degrees, 29.3 over the steepest stretch as long as a third of H.  The
-   friction angle is 25, of which a Drucker-Prager cone that does not dilate mobilises arcsin(eta) = 24.2; the last
-   hundredth of cohesion holds a little more.  Twice the cells or the steps, or half the viscosity, move run-out and
-   height by less than 2 %.
+1. Critical strength.  Without friction and drainage, the strength c is lowered by 1 % a step.  A vertical side of
+   height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
+   2000; the best circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
+   step as at first; 10 or 40 times move the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and
+   3.85, 3.9 and 1.9 % too late.  The error is of first order in the cell size, and the extrapolated value is 3.78.
+2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, far faster than it drains.
+   It slumps, and its crest rides on the flowing soil.  Before the toe, the water carries more than half of the
+   weight.  At rest the bank reaches twice as far as before; then the excess pressure drains.  The final slope is 23.5
+   degrees, and 29.3 over the steepest stretch of length H / 3.  The friction angle is 25.  A Drucker-Prager cone
+   without dilation mobilises arcsin(eta) = 24.2 of it; the last hundredth of cohesion adds a little.  Twice the cells
+   or the steps, or half the viscosity, change run-out and height by less than 2 %.
 
-The cohesion is a function of place, so the points carry it (`points.data["cohesion"]`) and an observer lowers it
-between two steps.  A step that does not converge is cut and tried again with the same strength; that helps
-because a viscous stress 2 eta D, a term in UFL like the weight, lets the bank move only so far in so much time.
-eta / T is a hundredth of gamma' H; part 1 does without.  No mesh would follow: what was the bank's side comes to lie
-on the floor, at plastic strains of several hundred per cent.
+The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  An observer lowers it
+between two steps.  A step without convergence is cut and repeated with the same strength.  This helps because a
+viscous stress 2 eta D, a term in UFL like the weight, limits the velocity of the bank.  eta / T is a hundredth of
+gamma' H; part 1 has no viscosity.  No mesh could follow: the side of the bank ends on the floor, at plastic strains
+of several hundred per cent.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ class Frame:
 
 @dataclass
 class Slump:
-    """What a run gives; `rest` and `drained` are the indices of the frames at which the two stages end.
+    """Results of a run; `rest` and `drained` are the indices of the frames at which the two stages end.
 
     alternating: rms, Pa, of the part of the pressures before the bank that alternates from cell to cell, at most.
     """
@@ -221,7 +220,7 @@ def slump(cells: int, steps: int) -> Slump:
 
 
 def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
-    """Return how far the results are from what they should be, relative; slopes in degrees."""
+    """Return relative errors of the results; slopes in degrees."""
     coarse, fine = (f.critical for f in failures)
     start, rest, end = run.frames[0], run.frames[run.rest], run.frames[run.drained]
     return {
@@ -238,7 +237,7 @@ def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost")
@@ -263,7 +262,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(run: Slump, found: dict[str, float]) -> None:
-    """Print the stages of the slump and what the errors say."""
+    """Print the stages of the slump and the errors."""
     rows = [["", "t (s)", "run-out (m)", "height (m)", "slope", "p (kPa)"]]
     for name, k in stages(run).items():
         f = run.frames[k]

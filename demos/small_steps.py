@@ -1,25 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Time steps as small as one likes: what is left is the error of the cells, at rest and on the move.
+"""Error as the time step tends to zero: it becomes the spatial error, at rest and in motion.
 
-Terzaghi's column (demo `terzaghi`) is taken to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps,
-0.1 to 1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, a cell's
-pressure compared at its centroid.  The part of the time integration falls with the step; what is left must be the
-error of the cells alone, found by an exact solution in time of their ordinary differential equations, and stay there
-however many steps are taken: a pressure that is averaged to points and back in every step would go on diffusing.
-Three columns:
+Terzaghi's column (demo `terzaghi`) is taken to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1 to
+1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, at the centroid
+of each cell.  The error of time integration falls with the step.  The rest must be the spatial error, which an exact
+solution in time of the semi-discrete equations gives.  It must stay constant for any number of steps: a pressure
+averaged to points and back in every step would diffuse.  Three columns:
 
 * resting on the grid;
-* moving: its foot is carried down by half the height meanwhile, through half of all cells;
-* moving, soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of hard water is
-  that which the strain of the points leaves; soft water's is brought from grid to grid by the remap as well.
+* moving: meanwhile its foot is carried down by half the height, through half of all cells;
+* moving, soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of stiff water follows from the
+  strain of the points.  The pressure of soft water is also remapped from grid to grid.
 
-What the motion adds is the strain that points of a cell share in a step, most of all where a cell holds little of
-the column at its drained top; the remap's own error is of second order and smaller.
+Motion adds an error: all points of a cell share its strain in a step.  It is largest at the drained top, in cells with
+little of the column.  The error of the remap itself is of second order and smaller.
 
-The overshoot, the largest p / p0 - 1 of all steps, is nothing at rest, however small the step: the scheme has
-no least time step in one dimension.  In more, small steps bring checkerboard modes of the pressure, unless its jumps
-are damped (`storage.py`): shown for a strip load on a layer in a rough box, first step, with and without damping.
-On one process.
+The overshoot, the largest p / p0 - 1 of all steps, is zero at rest for any step.  So the scheme has no smallest time
+step in one dimension.  In more dimensions, small steps cause checkerboard modes of the pressure, unless its jumps are
+damped (`storage.py`).  The demo shows them for a strip load on a layer in a rough box, first step, with and without
+damping.  On one process.
 """
 
 from __future__ import annotations
@@ -116,7 +115,7 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=25, help="cells over the height of the column")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="to T_v = 0.1")

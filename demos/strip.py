@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Large consolidation under a strip load: a layer as deep as it is wide settles by an eighth, and closes its pores.
+"""Large consolidation under a strip load: a layer as deep as wide settles by an eighth, and closes its pores.
 
-A layer between smooth walls on a smooth, sealed base carries a dead load q on a fifth of its drained surface; half of
-it is computed, x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6 and a
-conductivity k0 10^(5 (J - 1)) that falls as pores close; grains and water are incompressible.  T = k0 E t/(gamma_w H²)
-is the reduced time; the load comes until T = 0.01.  After Carter, Small and Booker (1977), in the form of Abaqus'
-benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, which a law without
-stiffness of the grains cannot stand: the package says so, and the demo shows its results up to then.
+A layer between smooth walls on a smooth, impervious base carries a dead load q on a fifth of its drained surface.
+Half of it is computed, x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6.  Its
+conductivity k0 10^(5 (J - 1)) falls as pores close.  Grains and water are incompressible.  T = k0 E t/(gamma_w H²) is
+the reduced time, and the load rises until T = 0.01.  After Carter, Small and Booker (1977), in the form of Abaqus'
+benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, where a law without
+stiffness of the grains fails.  The package reports it, and the demo shows its results up to then.
 
-Checks, for q/E = 0.25, against Taylor-Hood elements extrapolated in h from 20, 40 and 80 cells and in time, which has
-moved those of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1: `settlement`, the largest error of the middle's
-displacement from T = 0.1 on, `at_once` at T = 0.01, `edge` that of the strip's edge, where the load jumps, and
-`beside` that of the far corner, all relative to the middle's.  --reference runs such elements on the same cells.
-On one process.
+Checks for q/E = 0.25 use Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80 cells.  The
+extrapolation moves the result of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  `settlement` is the largest
+error of the middle's displacement from T = 0.1 on, `at_once` the error at T = 0.01.  `edge` refers to the strip's
+edge, where the load jumps, and `beside` to the far corner.  All are relative to the middle.  --reference runs such
+elements on the same cells. On one process.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def conditions(load: float) -> dict:
-    """Return what acts, load over E."""
+    """Return the conditions, load over E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
     return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
@@ -69,7 +69,7 @@ def times(a_decade: int) -> NDArray[np.float64]:
 
 @dataclass
 class Outcome:
-    """What has been seen: T, and displacements of PLACES over HEIGHT, up.
+    """Histories: T, and displacements of PLACES over HEIGHT, up.
 
     frames: T, corners, pressure over E and porosity of the points; why: why it ended early.
     """
@@ -129,7 +129,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--load", type=float, default=0.25, help="q/E")

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Write the figures of README.md and demos/README.md from what the demos print.
+"""Write the figures of README.md and demos/README.md from the output of the demos.
 
-A figure is followed by a comment that names the run of a demo, the entries of what it prints as JSON, and a format:
+A comment follows each figure.  It names the run of a demo, the entries of its JSON output, and a format:
 
     | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
-What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx, its
-pictures in demos/pictures (those of its first run on the pages).  A table that a demo writes as a file stands between
+demos/results keeps the output of the demos, with the run time in `seconds` and the release of dolfinx.  demos/pictures
+keeps the pictures of the first run on the pages.  The table of a demo's file stands between
 `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
     bash demos/run.sh tables                        # writes the figures anew from demos/results
@@ -37,7 +37,7 @@ TABLE = re.compile(
 
 
 def kept(run: str) -> Path:
-    """Return the file that keeps what a run has printed."""
+    """Return the file with the output of a run."""
     return RESULTS / (re.sub(r"\W+", "_", run) + ".json")
 
 
@@ -79,7 +79,7 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
 
 
 def take(run: str, table: str, pictures: bool) -> None:
-    """Run a demo, and keep what it prints, the table that it writes, and, if asked to, its pictures on the pages."""
+    """Run a demo, and keep its output, its table, and, if asked to, its pictures on the pages."""
     import dolfinx
 
     demo, *options = shlex.split(run)

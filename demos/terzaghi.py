@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Terzaghi's consolidation: a saturated layer is loaded at once and drains at its top.
 
-A column of 1 m between smooth walls, sealed at its foot, takes a load p0 in its first step.  The
-incompressible pore water carries all of it, p = p0, and hands it over to the skeleton as it drains:
-dp/dt = c_v d²p/dz², c_v = kappa (K + 4G/3).  The load strains the skeleton by 1e-5, so small strain is
-exact enough.  T_v = c_v t / height² is the reduced time.  Source: Terzaghi (1923); the series in
-Verruijt, Theory and Problems of Poroelasticity (2016).  On one process.
+A column of 1 m between smooth walls, impervious at its foot, takes a load p0 in its first step.  At first the
+incompressible pore water carries all of it, p = p0.  As it drains, the skeleton takes over: dp/dt = c_v d²p/dz², c_v
+= kappa (K + 4G/3).  The load strains the skeleton by 1e-5, so small-strain theory is accurate.  T_v = c_v t / height²
+is the reduced time.  Source: Terzaghi (1923); the series in Verruijt, Theory and Problems of Poroelasticity (2016).
+On one process.
 
-Errors: the largest over the depth of |p - exact| / p0 at T_v = 0.1, 0.5 and 1, a cell's pressure
-compared at the cell's centroid, and the relative error of the `settlement` at T_v = 0.5.  Steps are all
-alike, or with --rtol chosen by their error.
+Errors: the largest over the depth of |p - exact| / p0 at T_v = 0.1, 0.5 and 1, at the centroid of each cell, and the
+relative error of the `settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """What a run gives, an entry an output: T_v, depth and p of the cells and settlement, all over their scales."""
+    """Results of a run, an entry for each output: T_v, depth and p of the cells, settlement, over their scales."""
 
     result: mpm.Result
     time: list[float] = field(default_factory=list)
@@ -92,7 +91,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="equal steps to T_v = 1")
@@ -112,7 +111,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the depth and the settlement over time beside the exact curves."""
+    """Draw the pressure over the depth and the settlement over time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, time in enumerate(SAMPLES):

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Triaxial tests of soil laws at a point, beside closed forms: how to look at a law before it is used.
+"""Triaxial tests of soil laws at a point against closed forms: a check of a law before its use.
 
-Modified Cam Clay at three overconsolidation ratios, drained and undrained from the same isotropic stress.  Undrained
-the volume is closed, so that it ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs; on the way
-Q = M sqrt(P (P_c - P)).  Drained the path is q = 3 (p - p_0), and ends where it meets q = M p.  Mohr and Coulomb's sand
-ends where t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in Kirchhoff stresses, in compression and in extension.
+Modified Cam Clay at three overconsolidation ratios, drained and undrained, starts from the same isotropic stress.
+Undrained the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  On the way
+Q = M sqrt(P (P_c - P)).  Drained the path is q = 3 (p - p_0), and ends where it meets q = M p.  Mohr-Coulomb sand ends
+at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in Kirchhoff stresses, in compression and in extension.
 
-Errors are those of the ends, relative.
+Errors refer to the ends, and are relative.
 
---cost N squeezes a block of N x N cells of Drucker and Prager's, Mohr and Coulomb's and Cam Clay's soil, all of which
-yields, a step of each in turn, and prints the processor time of a step over that of Drucker and Prager's.
+--cost N compresses a block of N x N cells of Drucker-Prager, Mohr-Coulomb and Cam Clay soil until all of it yields.
+Steps alternate, and the demo prints the processor time of a step over that of Drucker and Prager's.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def costs(cells: int, steps: int = 30) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--steps", type=int, default=100, help="steps of a test")
     parser.add_argument("--cost", type=int, metavar="N", help="also print what a step costs, N x N cells")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The method from one cut domain to a consolidating column, to be read from top to bottom.
+"""The method, from one cut domain to a consolidating column, to be read from top to bottom.
 
-You need to know FEniCSx, but nothing of this package.  Each part prints what it has found, and ends in an assertion.
-On one process.
+You need to know FEniCSx, but nothing of this package.  Each part prints its result and ends in an assertion.  On one
+process.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--out", type=Path, default=Path("out/tutorial"), help="folder for the picture")
-out = parser.parse_args().out
+out = parser.parse_known_args()[0].out  # a notebook has options of its own
 
 # 1. A domain, cut by the grid.
 #
-# The grid is a box of equal cells, a dolfinx mesh.  A material point stands for a quadrilateral, its domain, whose
-# corners are tracked.  Corner k is at the lower or upper end of each axis: (0, 0), (1, 0), (0, 1), (1, 1).
+# The grid is a box of equal cells, a dolfinx mesh.  A material point represents a quadrilateral, its domain, and the
+# package tracks the corners.  Corner k is at the lower or upper end of each axis: (0, 0), (1, 0), (0, 1), (1, 1).
 
 grid = mpm.Grid(lower=[0, 0], upper=[0.4, 1.2], cells=[4, 12])
 domain = np.array([[[0.07, 0.22], [0.25, 0.26], [0.04, 0.36], [0.25, 0.46]]])
@@ -40,10 +40,10 @@ assert abs(pieces.fraction.sum() - 1) < 1e-14
 
 # 2. A form over it.
 #
-# Each piece is integrated at its centroid.  A Q1 function is its own Taylor polynomial about the midpoint of its
-# cell; so its value at the centroid is UFL, with the offset from the midpoint as a DG0 coefficient.  The list of
-# integration entities names a cell once for each of its pieces, each with coefficients of its own.  `points.value`,
-# `points.grad` and `points.dx` hide this.  Linear functions are integrated exactly, wherever the grid cuts.
+# Each piece is integrated at its centroid.  A Q1 function equals its Taylor polynomial about the midpoint of its cell.
+# Its value at the centroid is therefore UFL, with the offset from the midpoint as a DG0 coefficient.  The list of
+# integration entities contains a cell once for each of its pieces, each with its own coefficients.  `points.value`,
+# `points.grad` and `points.dx` hide this.  Linear functions are integrated exactly for any cut.
 
 points = FormPoints(grid)
 cells = grid.local(grid.number(grid.index(pieces.x)))
@@ -61,9 +61,9 @@ assert abs(per_cell.sum() - exact) < 1e-15
 
 # 3. The balance of momentum, by hand.
 #
-# A soft column of 0.4 m x 0.95 m stands on the floor between smooth walls and sinks under its weight.  Its top lies in
-# the middle of a cell: the body does not fit the grid, and need not.  The energy of the step is that of the skeleton
-# less the work of the weight.  Residual and tangent are its derivatives, by UFL.
+# A soft column of 0.4 m x 0.95 m stands on the floor between smooth walls and settles under its weight.  Its top lies
+# in the middle of a cell, because a body need not fit the grid.  The energy of the step is the energy of the skeleton
+# less the work of the weight.  UFL derives residual and tangent.
 
 BULK, SHEAR, WEIGHT = 1e5, 6e4, 1e4  # Pa, Pa, N/m^3
 corners = mpm.box(grid, [0, 0], [0.4, 0.95], per_cell=2).corners()
@@ -81,7 +81,7 @@ residual_form, tangent_form = (PointForm(form, points) for form in (residual, uf
 F_n = np.tile(np.eye(2), (len(corners), 1, 1))
 data = points.at(cells, pieces.x, pieces.fraction * volume[pieces.point], F=F_n[pieces.point])
 
-# Nodes of cells without soil have no equation; walls hold.  What is left is solved by Newton's method.
+# Nodes of cells without soil have no equation, and walls fix theirs.  Newton's method solves the other equations.
 
 active = np.zeros(len(grid.node_x), dtype=bool)
 active[grid.cell_nodes[cells]] = True
@@ -107,8 +107,8 @@ assert size < 1e-8
 
 # 4. The points move, and the grid forgets.
 #
-# Corners follow the displacement of the grid, and F follows its gradient: here over the pieces of each domain, as in
-# standard MPM.  Then u is set to zero: the next step begins on the undeformed grid, at new places in it.
+# Corners follow the displacement of the grid.  F follows its gradient, here over the pieces of each domain, as in
+# standard MPM.  Then u is set to zero, and the next step starts on the undeformed grid.
 
 nodal, x = u.x.array.reshape(-1, 2), corners.reshape(-1, 2)
 at = grid.local(grid.number(grid.index(x)))
@@ -123,8 +123,10 @@ apart = np.abs(np.linalg.det(F_n) * volume / volumes(moved) - 1).max()
 print(f"4. the column has sunk by {settlement:.5f} m; det F and the corners' volumes agree to {apart:.0e}")
 assert apart < 1e-3
 
-# 5. The same by the package, which also moves corners by second differences, takes F from them, and cares for nearly
-# empty cells, locking, surfaces, water, time, several processes, and much that can go wrong.
+# 5. The same by the package.
+#
+# The package also moves corners by second differences and computes F from them.  It treats nearly empty cells, locking,
+# surfaces, water, time integration and several processes.
 
 soil = mpm.NeoHookean(bulk=BULK, shear=SHEAR, porosity=0.5, grain_density=WEIGHT / 9.81 / 0.5)  # dry
 column = mpm.box(grid, [0, 0], [0.4, 0.95], per_cell=2)

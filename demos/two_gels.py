@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Two gels meet: they are pressed together, slide over each other with friction, and part.
+"""Contact of two gels: they are pressed together, slide with friction, and separate.
 
-Half-discs of two groups of bodies, each with displacements of its own.  The lower one is held, the upper one follows a
-path.  While they are apart nothing acts between them, however narrow the gap.  As the upper one passes over the top of
-the lower one, the contact inclines: the force along the path, over that up, falls below the friction coefficient.
+Two half-discs are groups of bodies, each with its own displacements.  The lower one is fixed, the upper one follows a
+path.  While they are apart no force acts between them, however narrow the gap.  As the upper one passes over the top of
+the lower one, the contact inclines.  The force along the path, over the vertical force, then falls below the friction
+coefficient.
 
-Beside it the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the force that the
-contact takes.  Both are off by what a few cells over the half-width cannot resolve.
+A second scene is the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the actual
+force of the contact.  Both have the error of a few cells over the half-width.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def hertz(cells: int) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel")
     parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies")

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Water tables under suction: one that rises under rain (Vauclin), and that of a levee in a flood wave.
+"""Water tables with suction: one rises under rain (Vauclin), the other is that of a levee in a flood.
 
-A slab of sand, 6 m wide and 2 m high, of which a half is seen, stands on an impervious base between ditches.  Rain
-falls on its middle metre for eight hours; water spreads above the table, through soil that is half full.  Beside it
-the converged solution of finite volumes, of cells of 1.25 cm.  Source: Vauclin, Khanji and Vachaud (1979), with their
-laws; soil that lies above the ditch's level lets nothing out.
+A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of it is computed.  Rain
+falls on its middle metre for eight hours.  Water spreads above the table, through unsaturated soil.  The reference is
+a converged solution of finite volumes, with cells of 1.25 cm.  Source: Vauclin, Khanji and Vachaud (1979), with their
+laws. Soil above the level of the ditch is a seepage face without outflow.
 
-Then a levee of 3 m with slopes of 1:2 on an impervious base.  A flood rises by 2.5 m in two days, stands for two and
-falls in two.  Its soil drains under suction, and what comes in late leaves late.
+The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  A flood rises by 2.5 m in two days, stays
+for two days and falls in two days.  Its soil drains under suction, so late infiltration leaves late.
 
-Errors: of the height of the table at six places after 2, 3, 4 and 8 hours, the largest in m, and of the flow into the
-ditch at the end.  `balance`: water of the slab beside what has come and gone, over what has rained.  On one process.
+Errors: the largest of the height of the table, m, at six positions after 2, 3, 4 and 8 hours; of the outflow into the
+ditch at the end.  `balance`: error of the water balance of the slab, over the rain.  On one process.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def levee(h: float) -> mpm.Simulation:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; that of the levee is 2.5 h")
     parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; those of the levee: 9 times")
@@ -145,7 +145,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, frames: list) -> None:
-    """Draw the tables of the slab, beside converged ones, and pressures in the levee."""
+    """Draw the tables of the slab with converged ones, and pressures in the levee."""
     fig, axes = common.figure(1 + len(frames), 1, (8, 10))
     first, *others = np.ravel(axes)
     for i, (hours, x, z) in enumerate(curves):

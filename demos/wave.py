@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Waves in columns of soil, dry and saturated, beside exact solutions.
+"""Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A load that comes all at once on a dry column, 10 m high: on a rigid base, where the wave comes back, and on a quiet
-   one, through which it leaves.  The base bears nothing until L / c, then on a rigid one 2 q until 3 L / c, on a quiet
-   one q; behind the front particles move by q / (rho c).  Stresses ring behind a front: their means are compared.
-2. A load that swings on a saturated column of 10 m, drained on top (Zienkiewicz, Chang and Bettess 1980), slow or
-   fast: settlement of the top and pore pressures, as complex amplitudes, once it swings alike in every period.  Water
-   drains from 0.3 m below the top of the slow one, little more than a cell: its settlement is not judged.
-3. The same column under a load that comes all at once, with water and grains that do not change their volume, k = 0.01
-   m/s, while no wave has come back from its base (after de Boer, Ehlers and Liu 1993): its settlement is
-   q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2 a) ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
+1. A sudden load on a dry column, 10 m high, on a rigid base, which reflects the wave, and on an absorbing base.  The
+   base carries nothing until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing one q.  Behind the
+   front particles move by q / (rho c).  Stresses oscillate behind a front, so their means are compared.
+2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), slow or
+   fast. Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
+   water drains from 0.3 m below the top, little more than a cell, and its settlement is not judged.
+3. The same column under a sudden load, with incompressible water and grains, k = 0.01 m/s, before a wave returns from
+   its base (after de Boer, Ehlers and Liu 1993).  Its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2 a)
+   ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
 
-The equations are those of displacement and pressure, u-p: water accelerates as grains do.
+The equations are the u-p form: water accelerates with the grains.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return what --json prints."""
+    """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the columns")
     parser.add_argument("--steps", type=int, default=50, help="steps a period of the load that swings")
@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, dry: dict, swings: dict, loaded: dict[str, np.ndarray]) -> None:
-    """Draw stresses at the base, amplitudes of pressure over the depth, and settlements, beside exact ones."""
+    """Draw stresses at the base, amplitudes of pressure over the depth, and settlements, with exact ones."""
     fig, ((base, depth, top),) = common.figure(1, 3, (14, 4.4))
     steps = {"rigid": [0, 0, 2, 2, 0, 0], "quiet": [0, 0, 1, 1, 1, 1]}
     for k, (name, run) in enumerate(dry.items()):

@@ -2,12 +2,12 @@
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
-`NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own
-`Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`,
-`Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`, `Cone`).  Its `run` gives a
-`Result` with what `probes` record, and feeds a `Writer`, whose files `one_file` joins, and a `Checkpoint`, from which
-`resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms
-and sources in UFL: see `mpm_dolfinx.materials.user_functions`.
+`NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`,
+`BarcelonaBasic`, or your own `Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`,
+`Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`,
+`Cone`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer`, whose files `one_file` joins, and
+a `Checkpoint`, from which `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens
+it until it slides.  Terms and sources in UFL: see `mpm_dolfinx.materials.user_functions`.
 
 SI units throughout, or any that are consistent (`Fluid`).  Stress is positive in tension, pore pressure in compression;
 2D is plane strain, and forces are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
@@ -46,7 +46,7 @@ from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
 from mpm_dolfinx.io.plots import plot
 from mpm_dolfinx.io.writer import Writer
-from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
+from mpm_dolfinx.materials.cam_clay import BarcelonaBasic, ModifiedCamClay
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager
 from mpm_dolfinx.materials.initial_stress import K0, hydrostatic
 from mpm_dolfinx.materials.mohr_coulomb import MohrCoulomb
@@ -82,6 +82,7 @@ __all__ = [
     "K0",
     "Acting",
     "Ball",
+    "BarcelonaBasic",
     "Body",
     "BrooksCorey",
     "CellFields",

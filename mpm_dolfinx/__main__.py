@@ -97,7 +97,7 @@ def run_element_test(o: argparse.Namespace) -> None:
         raise ValueError(f"--draw {o.draw}: there is no folder {Path(o.draw).parent}")
     law, strain = law_of(o.law), number("strain", o.strain)
     soil = law(**constants_of(law, o.constants))
-    options = {name: getattr(o, name) for name in ("steps", "confinement", "rate", "cell_size")}
+    options = {name: getattr(o, name) for name in ("steps", "confinement", "rate", "cell_size", "suction")}
     r = mpm_dolfinx.element_test(soil, o.test, strain, **options)
     print(f"{'strain':>10} {'p (Pa)':>12} {'q (Pa)':>12} {'pore p. (Pa)':>12} {'volume strain':>13}")
     for k in np.unique(np.linspace(0, len(r.strain) - 1, 21, dtype=int)):
@@ -118,6 +118,7 @@ def main(argv: list[str] | None = None) -> None:
     lab.add_argument("constants", nargs="*", metavar="name=value", help="of the law; vectors with commas")
     lab.add_argument("--steps", type=int, default=100, help="to each turning point (100)")
     lab.add_argument("--confinement", type=float, default=0.0, help="isotropic effective stress before, Pa (0)")
+    lab.add_argument("--suction", type=float, default=0.0, help="of the soil at the start, Pa (0)")
     lab.add_argument("--rate", type=float, help="strain in a second, of laws that depend on it, 1/s")
     lab.add_argument("--cell-size", type=float, help="size of cells, of laws that soften, m")
     lab.add_argument("--draw", help="file of a picture")

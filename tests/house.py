@@ -27,7 +27,7 @@ SOURCE = re.compile(
 PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-]+), cells ([\d.e+-]*[\d])")
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""
-STYLES = ("figsize", "alpha", "dpi")
+STYLES = ("figsize", "alpha", "dpi", "bounds")
 CONDITIONS = (
     "Traction",
     "Pressure",
@@ -159,12 +159,7 @@ def inline() -> list[str]:
     for module in modules():
         within = [n for n in module.nodes if isinstance(n, ast.FunctionDef | ast.Lambda)]
         chosen = {m for f in within for d in [*f.args.defaults, *f.args.kw_defaults] if d for m in literals(d)}
-        styles = {
-            m
-            for n in module.nodes
-            if isinstance(n, ast.keyword) and n.arg in ("figsize", "alpha", "dpi")
-            for m in literals(n)
-        }
+        styles = {m for n in module.nodes if isinstance(n, ast.keyword) and n.arg in STYLES for m in literals(n)}
         checks = {m for n in module.nodes if isinstance(n, ast.Compare) and len(n.ops) > 1 for m in literals(n)}
         factors = {
             m

@@ -82,7 +82,7 @@ def test_the_command_prints_and_draws(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["CamClay", "oedometer", "0.1"], "law = 'CamClay', must be one of DruckerPrager, "),
+        (["CamClay", "oedometer", "0.1"], "law = 'CamClay', must be one of BarcelonaBasic, DruckerPrager, "),
         (["laws.py:Clay", "oedometer", "0.1"], "law = 'laws.py:Clay': there is no file laws.py"),
         (["Hencky", "oedometer", "10%"], "strain = '10%', must be a number"),
         (["Hencky", "oedometer", "0.1", "shear=3MPa"], "Hencky: shear = '3MPa', must be a number"),

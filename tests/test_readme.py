@@ -13,6 +13,7 @@ import tables
 import mpm_dolfinx as mpm
 
 ROOT = Path(__file__).parent.parent
+COMMANDS = ("reference", "notebooks")  # of demos/run.sh, beside the demos
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "demos/README.md", "mpm_dolfinx/README.md")}
 BLOCKS = [
     pytest.param(code, id=f"{name.removesuffix('/README.md')}-{k}")
@@ -40,8 +41,8 @@ def test_named_files_exist(name):
         assert any((start / file).exists() for start in (ROOT, ROOT / "mpm_dolfinx")) or file == "my_scene.py", file
     for file in re.findall(r"tests/test_\w+\.py", page):
         assert (ROOT / file).exists(), file
-    for demo in re.findall(r"demos/run\.sh (?:-n \d )?([a-z]\w+)", page):
-        assert (ROOT / "demos" / f"{demo}.py").exists(), demo
+    for demo in re.findall(r"demos/run\.sh (?:-n \d )?([a-z][\w/]+)", page):
+        assert demo in COMMANDS or (ROOT / "demos" / f"{demo}.py").exists(), demo
 
 
 def test_the_version_is_everywhere_the_same():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The families of `extreme_cases`: what is extreme, scenes, exact solutions, and the bounds of the errors."""
+"""The families of `extreme_cases`: extreme property, scenes, exact solutions, and bounds of the errors."""
 
 from __future__ import annotations
 

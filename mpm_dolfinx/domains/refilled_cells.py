@@ -22,8 +22,8 @@ APART = 0.01
 
 Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
 """
-CRUMB = APART**2
-"""Share of a cell that is no domain of its own: what is left of one beside it has its mass.  Source: definition."""
+CRUMB = NEAR
+"""Area, in cells, below which a part of a domain is dropped; its mass goes to the other parts.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
 """Share of a cell: where less is left of a domain, its cell is filled anew as well.
 
@@ -208,7 +208,6 @@ class RefilledCells:
         once &= np.abs(Q - P - way).max(axis=1) < APART
         once &= np.linalg.norm(Q - P, axis=1) > APART
         a, b = x[:, 0] - P[cell], x[:, 1] - P[cell]
-        bulge = sum_by(cell, (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, self.cells)
         along = np.einsum("mi,mi->m", a + b, (Q - P)[cell])
         order = np.lexsort((along, cell))
         order = order[once[cell[order]]]
@@ -219,7 +218,7 @@ class RefilledCells:
         kept = once[cell]
         cell, x = cell[kept], x[kept]
         at = np.flatnonzero(once)
-        surface = resampled(np.searchsorted(at, cell), x, P[at], Q[at], bulge[at])
+        surface = resampled(np.searchsorted(at, cell), x, P[at], Q[at])
         region = Region(at, surface)
         barred[at[~region.sound]] = True
         return passed, region
@@ -357,13 +356,14 @@ class RefilledCells:
         left = np.flatnonzero(self.gone[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
         left = left[area > CRUMB * self.grid.cell_volume]
-        rings, of = _convex(points.corners[pieces.point[left]])
+        rings, of = _convex(points.corners[pieces.point[left]], self.grid.h)
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
-        polygons = rings.within(self._place(self.cell[left][of], halves)).simplified(NEAR * self.grid.h.min())
+        near = NEAR * self.grid.h.min()  # else rounding would part a surface on a grid line
+        polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
-        sound = Polygons.rings(quads).area > CRUMB**2 * self.grid.cell_volume
+        sound = Polygons.rings(quads).area > CRUMB * self.grid.cell_volume
         piece, quads = piece[sound], quads[sound]
         edge = edge[sound]
         left, number = np.unique(piece, return_inverse=True)
@@ -413,32 +413,31 @@ class RefilledCells:
         slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / h[:, None]
         return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.left]])[group]]
 
-    def pairs(
-        self, corners: NDArray[np.float64], group: NDArray[np.int64]
-    ) -> tuple[NDArray, NDArray, NDArray, tuple[NDArray, NDArray, NDArray]]:
-        """Return pairs of old and new domains: both, and the share of the old one's mass in the new one.
-
-        Last, of pieces of old domains: the domain, the group that they go to, and their share of it.
-        """
+    @cached_property
+    def into(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Pieces of domains that are gone, the group that each goes to, and its share of its domain."""
         pieces = self.pieces
         into = np.flatnonzero(self.chosen[self.cell] & self.gone[pieces.point])
         piece = np.concatenate([into, self.left])
         groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.left))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
-        share = share / whole[pieces.point[piece]]  # of slivers that are dropped
+        return piece, groups, share / whole[pieces.point[piece]]  # of slivers that are dropped
+
+    def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Return pairs of old and new domains: both, and the share of the old one's mass in the new one."""
+        piece, groups, share = self.into
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
         of, at = ranges(first, stop - first)
         at = order[at]
-        old = pieces.point[piece[of]]
+        old = self.pieces.point[piece[of]]
         common = np.zeros(len(of))
-        rings, which = _convex(self.points.corners[old])
+        rings, which = _convex(self.points.corners[old], self.grid.h)
         common += np.maximum(sum_by(which, rings.within(corners[at][which][:, RING]).area, len(of)), 0.0)
         common += EPSILON * np.abs(volumes(corners[at]))  # what no piece lies on gets the mean of its cell
         total = sum_by(of, common, len(piece))
-        gone = pieces.point[piece]
-        return old, at, share[of] * common / total[of], (gone, groups, share)
+        return old, at, share[of] * common / total[of]
 
     def on_faces(
         self,
@@ -468,14 +467,17 @@ def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[n
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 
-def _convex(corners: NDArray[np.float64]) -> tuple[Polygons, NDArray[np.int64]]:
-    """Return domains (n, 4, 2) as convex polygons, whose edges have the numbers of faces, and the domain of each."""
+def _convex(corners: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[Polygons, NDArray[np.int64]]:
+    """Return domains (n, 4, 2) as convex polygons, whose edges have the numbers of faces, and the domain of each.
+
+    h (2,): edges of a cell, m.
+    """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))
     away = np.roll(ring, -1, axis=1) - ring
     before = np.roll(away, 1, axis=1)
     turn = before[:, :, 0] * away[:, :, 1] - before[:, :, 1] * away[:, :, 0]
-    bent = turn.min(axis=1) < 0
+    bent = turn.min(axis=1) < -NEAR * h.prod()  # else rounding would choose a diagonal
     even = np.flatnonzero(~bent)
     out, of = [(ring[even], edge[even])], [even]
     at = np.flatnonzero(bent)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mean_density
@@ -21,10 +21,7 @@ from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility
 from mpm_dolfinx.flow.layers import MixedCells
 from mpm_dolfinx.flow.series import Ways, none, through
-from mpm_dolfinx.flow.unsaturated import Laws
-from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 
 
 class Borders:
@@ -59,7 +56,7 @@ class Borders:
         if mixed is not None:
             self.mixed[mixed.cells] = np.arange(len(mixed.cells))
             known[mixed.cells, 0] = 1.0
-        known = with_ghosts(grid, known)
+        known = with_ghosts(grid.cellwise(), known)
         self._place = np.zeros(grid.num_local, dtype=np.int64)
         self._place[contents.filled] = np.arange(len(contents.filled))
         self._law = known[:, 1].astype(np.int64)
@@ -77,7 +74,7 @@ class Borders:
         self._slot = np.searchsorted(self._cells, self._pair)
 
     def faces(
-        self, laws: Laws, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
+        self, laws: Any, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
     ) -> BorderFaces:
         """Return the faces as the cells conduct.
 
@@ -97,7 +94,7 @@ class Borders:
             plain = replace(flow, mobility=Mobility(np.ones(len(contents.filled))))
             held = contents.slot(np.flatnonzero(self.mixed >= 0))
             ways = ways.eased(plain.along(d)[held])
-        slots = int(over_all(grid.comm, slots, MPI.MAX))
+        slots = grid.comm.allreduce(slots, MPI.MAX)
         own = np.flatnonzero(self._cells < grid.num_owned)
         cells, along = self._cells[own], flow.along(d)
         out = none(len(self._cells), len(laws.scales), slots).everywhere(d)
@@ -130,7 +127,7 @@ class Borders:
 
     def through_sides(
         self,
-        laws: Laws,
+        laws: Any,
         mobility: Mobility,
         cells: NDArray[np.int32],
         normal: NDArray[np.float64],
@@ -161,7 +158,7 @@ class Borders:
         width = np.cumsum([column.shape[1] for column in columns])
         rows = np.zeros((self.grid.num_local, width[-1]))
         rows[self._cells] = np.concatenate(columns, axis=1)
-        found = np.split(with_ghosts(self.grid, rows)[self._cells], width[:-1], axis=1)
+        found = np.split(with_ghosts(self.grid.cellwise(), rows)[self._cells], width[:-1], axis=1)
         return Ways(*(part.reshape(of.shape).astype(of.dtype) for part, of in zip(found, ways, strict=True)))
 
 
@@ -176,7 +173,7 @@ class BorderFaces:
 
     borders: Borders
     mobility: Mobility
-    laws: Laws
+    laws: Any
     pair: NDArray[np.int64]
     area: NDArray[np.float64]
     ways: list[Ways]
@@ -188,7 +185,9 @@ class BorderFaces:
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
         """Return what flows at pressures (2, m) of the cells, Pa; force (c, d): of inertia on the fluid, N/m^3."""
         weight = (
-            self.weight if force is None else self.weight + with_ghosts(self.borders.grid, force)[self.pair].mean(0)
+            self.weight
+            if force is None
+            else self.weight + with_ghosts(self.borders.grid.cellwise(), force)[self.pair].mean(0)
         )
         falls = [(way * weight).sum(axis=1) for way in self.apart]
         found = through(self.laws, p, self.ways, self.lengths, falls)
@@ -222,15 +221,3 @@ class BorderFlows:
         entries = (x.ravel().astype(PETSc.IntType) for x in (starts, columns, number))
         starts, columns, rows = entries
         A.setValuesIJV(starts, columns, values.ravel(), addv=True, rowmap=rows)
-
-
-def with_ghosts(grid: Grid, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows (c, k) of the local cells, those of ghosts as their owners have them."""
-    if grid.comm.size == 1:
-        return rows
-    carrier, out = fem.Function(grid.cellwise()), np.empty_like(rows)
-    for i, column in enumerate(rows.T):
-        carrier.x.array[:] = column
-        carrier.x.scatter_forward()
-        out[:, i] = carrier.x.array
-    return out

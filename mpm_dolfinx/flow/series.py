@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME, TINY
 from mpm_dolfinx.flow.unsaturated import Laws
-from mpm_dolfinx.pores.pore_water import MOST
 from mpm_dolfinx.pores.retention import FARTHEST
+
+MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
 
 
 class Ways(NamedTuple):

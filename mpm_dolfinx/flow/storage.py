@@ -49,7 +49,7 @@ from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
-from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
@@ -274,8 +274,7 @@ class StorageSystem:
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
-        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
-        self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
+        self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
@@ -285,6 +284,16 @@ class StorageSystem:
             pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
             pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
+
+    @property
+    def gravity(self) -> FacetSum | None:
+        """What p and the fluid's weight drive between cells that conduct alike, if there is a weight."""
+        return self._alike(self._forms.fluxes.gravity)
+
+    def _alike(self, form: FacetForm | None) -> FacetSum | None:
+        """Return a form over the faces between cells that conduct alike, see `Relative`."""
+        relative = self._forms.fluxes.relative
+        return form and form.on(self._facets if relative is None else relative.alike(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return where on the grid this process's unknowns are, and none that are held: see `multigrid_solver`."""
@@ -318,10 +327,6 @@ class StorageSystem:
         """Assemble the fluxes through inner faces; off: of `AslantFlow`, where there is any."""
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
-        if fluxes.relative is not None:
-            borders = flow.mobility.borders
-            alike = self._facets if borders is None else borders.alike
-            self._flux, self.gravity = fluxes.flux.on(alike), fluxes.gravity.on(alike)
         if (relative := self._forms.fluxes.relative) is not None:
             p = self._forms.p.x.array[contents.filled]
             mobility = mobility * relative.at(contents.filled, p)[:, None]
@@ -340,8 +345,8 @@ class StorageSystem:
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
             borders = relative.set_pressures(self._forms.p.x.array, force)
-        if self._flux is not None:
-            self._flux.assemble_matrix(self.T)
+        if (flux := self._alike(self._forms.fluxes.flux)) is not None:
+            flux.assemble_matrix(self.T)
         if borders is not None:
             borders.add_slopes(self.T, self.unknowns)
         self.T.assemble()
@@ -537,8 +542,6 @@ class StorageProblem:
 
         Also, where pores drain, by how much the logarithm of their suction changes; went: the same of the step before.
         """
-        if self._scale is None:
-            return dp, went
         p = self.forms.p.x.array[self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, went)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
@@ -642,8 +645,13 @@ class StorageProblem:
         """
         return (-rates.taken(self.dt).cells - self._before.cells) / self._density
 
-    def assemble_tangent(self, data: PointData | None = None) -> None:
-        """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""
+    def assemble_tangent(
+        self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
+    ) -> None:
+        """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others.
+
+        of_suction: cells (c,), and what the forces on their nodes (c, n) gain by their pressures in laws, m^(d-1).
+        """
         forms = self.forms
         system = self.system
         data = data or self.data
@@ -651,6 +659,8 @@ class StorageProblem:
         for A, rows in zip((system.B_momentum, system.B), by_u, strict=False):
             zero(A)
             insert_rows(A, forms.grid, data.places.filled, rows)
+            for cells, more in of_suction if A is system.B_momentum else ():
+                insert_rows(A, forms.grid, cells, -more)
             A.assemble()
         if forms.fluxes.relative is not None:
             self._flow(False)

@@ -169,6 +169,11 @@ class Relative:
         pair = p[faces.pair]
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
+    def alike(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return those of the faces between active cells on whose sides soils conduct alike."""
+        faces = self._borders.value
+        return facets if faces is None else faces.borders.alike
+
     def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return k_r (m,) of owned cells at pressures (m,), Pa."""
         k = np.stack([np.ones(len(p)), *(law(p)[:, 1] for law in self._laws.conductances)], axis=1)

@@ -68,14 +68,15 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     ax.set(aspect="equal", xlabel=f"{radius} (m)", ylabel="y (m)")
     if bar:
         known = unit(field)
-        ax.figure.colorbar(drawn, ax=ax, label=label or field.replace("_", " ") + (f" ({known})" if known else ""))
+        label = label or field.replace("_", " ") + (f" ({known})" if known else "")
+        ax.figure.colorbar(drawn, cax=ax.inset_axes(bounds=(1.03, 0, 0.04, 1)), label=label)  # as high as the body
     return ax
 
 
 def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     """Return the values (n,) of a field at the points of this process."""
     points, asked = simulation.points, {}
-    if str(field).startswith(("porosity", "effective_", "stress", "mean_", "deviatoric_")):
+    if str(field).startswith(("porosity", "saturation", "effective_", "stress", "mean_", "deviatoric_")):
         asked = asked_of_points(simulation)  # collective
     known: dict[str, Callable[[], Any]] = {
         "displacement": lambda: np.linalg.norm(points.displacement, axis=1),
@@ -86,6 +87,8 @@ def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     if simulation.scene.fluid is not None:
         known["pressure"] = lambda: points.pressure
     known |= {name: lambda rows=rows: rows for name, rows in {**points.data, **asked}.items() if rows.ndim == 1}
+    if simulation.scene.fluid is None:  # the effective stress is the stress
+        known |= {name.removeprefix("effective_"): known[name] for name in known if name.startswith("effective_")}
     if field not in known:
         names = ", ".join({**known, **(asked or asked_of_points(simulation))})
         raise ValueError(f"plot: field = {line(field)}, must be one of {names}")

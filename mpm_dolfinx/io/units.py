@@ -14,6 +14,7 @@ FIELDS = {
         "mean_effective_stress": "Pa, p' = -(xx + yy + zz) / 3, positive in compression",
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
         "porosity": "-, current volume fraction of the pores",
+        "saturation": "-, volume fraction of water in the pores, of unsaturated soil",
         "owed, due": "-, volume defect over reference volume; its part that the next step corrects",
         "softness": "-, elastic over tangent shear modulus where a law yields, 1 to 100",
         "tool_pressure, tool_shear": "Pa, contact pressure and shear of the tool `tool` on the surface of the domain",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Modified Cam Clay at finite strain (Borja and Tamagnini 1998), with one local unknown.
+"""Modified Cam Clay at finite strain (Borja and Tamagnini 1998), with one local unknown; Barcelona's with suction.
 
 Multiplicative, in principal logarithmic strains, as Drucker and Prager's law: with the elastic volume strain e_v and
 deviator e (tension positive), pressure P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau| in Kirchhoff stress,
@@ -23,7 +23,9 @@ step has no solution and is cut.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from inspect import Parameter, Signature
 from typing import ClassVar
 
 import numpy as np
@@ -32,7 +34,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.materials.skeleton import Field, Skeleton, _check, check_given
+from mpm_dolfinx.materials.skeleton import DRIED, Field, Skeleton, _check, check_given
 from mpm_dolfinx.materials.trial import Trial
 
 GIVEN = {
@@ -194,6 +196,107 @@ class ModifiedCamClay(Skeleton):
             "plastic": ufl.conditional(to.yields, back * b * back.T, plastic),
             "consolidated": consolidated + ufl.conditional(to.yields, to.rho * a, 0.0),
         }
+
+
+LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference": "> 0 Pa and finite"}
+"""Constants of the loading-collapse curve, and what they may be."""
+
+
+def _dried(function: Callable) -> Callable:
+    """Return one of Modified Cam Clay's functions as it is under suction: of another lambda and P_c."""
+    taken = Skeleton.taken_by(function)
+
+    def of(**given):
+        wet, kappa, consolidated = (given[name] for name in ("lambda_", "kappa", "consolidated"))
+
+        def slope(s):
+            return wet * (1 - (1 - given["r"]) * (1 - ufl.exp(-given["beta"] * s)))
+
+        def power(s):
+            return (wet - kappa) / (slope(s) - kappa)
+
+        start = ufl.ln(given["yield_pressure"] / given["reference"])
+        begun = ufl.conditional(ufl.gt(start, 0), start / power(given["suction_at_start"]), start)
+        size = begun + consolidated  # ln(P_c0 / P_r)
+        s = ufl.conditional(ufl.gt(size, 0), given["trial"]["suction"], 0.0)
+        dried = consolidated + (power(s) - 1) * size + (begun - start)  # ln of P_c over that at the start
+        out = function(**({name: given[name] for name in taken} | {"lambda_": slope(s), "consolidated": dried}))
+        if function is ModifiedCamClay.update:
+            out["consolidated"] = consolidated + (out["consolidated"] - dried) / power(s)
+        return out
+
+    of.__signature__ = Signature([Parameter(name, Parameter.KEYWORD_ONLY) for name in (*taken, *DRIED[1:], *LC)])
+    of.__qualname__ = function.__qualname__
+    return of
+
+
+@dataclass(frozen=True, kw_only=True)
+class BarcelonaBasic(ModifiedCamClay):
+    """Modified Cam Clay whose yield surface grows with suction: soil that collapses as it gets wet.
+
+    At a suction s = max(-p, 0) the yield surface in Bishop's stress has the size
+
+        P_c / P_r = (P_c0 / P_r)^((lambda(0) - kappa) / (lambda(s) - kappa)),
+        lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
+
+    the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  So soil of a constant
+    suction is Modified Cam Clay with lambda(s), and saturated soil with lambda(0).  Strength by suction, and what soil
+    swells by as it gets wet, are those of Bishop's stress.  The suction is that of the end of a substep.  Where P_c0
+    has fallen to P_r, suction changes nothing.
+
+    Parameters
+    ----------
+    lambda_
+        Slope lambda(0) of saturated soil.
+    OCR
+        Overconsolidation ratio, -, >= 1: P_c at the suction of the start over that through the initial stress.
+    initial_stress : (3,), Pa
+        Bishop's effective stresses at F = I.
+    r
+        lambda of very dry soil over lambda(0), -, > kappa / lambda_, <= 1.
+    beta
+        How fast lambda falls with suction, 1/Pa, >= 0.
+    reference
+        Stress P_r, Pa, > 0, at which suction changes nothing; a hundredth to a half of P_c0 is usual.
+
+    The other parameters are those of `ModifiedCamClay`.  In a scene with fluid `retention` must be given.  The state is
+    that of Modified Cam Clay, `consolidated` that of P_c0, and `suction`, Pa.  Alonso, Gens and Josa (1990); in
+    Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range, or is not given.
+    """
+
+    r: Field = None
+    beta: Field = None
+    reference: Field = None
+
+    state: ClassVar = {**ModifiedCamClay.state, **dict.fromkeys(DRIED, 0.0)}
+
+    def __post_init__(self):
+        check_given(self, LC)
+        super().__post_init__()
+        if not (callable(self.kappa) or callable(self.lambda_)):
+            least = np.asarray(self.kappa) / self.lambda_
+            _check(
+                self,
+                "r",
+                lambda v: (v > least * (1 + SAME)) & (v <= 1),
+                f"> kappa / lambda_ = {np.max(least):g} and <= 1",
+            )
+        _check(self, "beta", lambda v: (0 <= v) & np.isfinite(v), LC["beta"])
+        _check(self, "reference", lambda v: (0 < v) & np.isfinite(v), LC["reference"])
+
+    @staticmethod
+    def trial(F, prestretch, plastic, suction):
+        """Return what the trial of Modified Cam Clay is, and the suction."""
+        return {**ModifiedCamClay.trial(F, prestretch, plastic), "suction": suction}
+
+    residual = staticmethod(_dried(ModifiedCamClay.residual))
+    kirchhoff = staticmethod(_dried(ModifiedCamClay.kirchhoff))
+    update = staticmethod(_dried(ModifiedCamClay.update))
 
 
 class _Return:

@@ -21,7 +21,7 @@ from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
-from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton, constants_of
+from mpm_dolfinx.materials.skeleton import BY_SCENE, DRIED, Fluid, Skeleton, constants_of
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
@@ -138,6 +138,7 @@ class SceneMaterials:
                 mine = np.zeros((len(points), *value.shape[1:]))
                 mine[here] = value[rows]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
+        seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
         self._softness: dict[int, SoftnessAtPoints] = {}
@@ -181,6 +182,8 @@ class SceneMaterials:
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         m.check_cells(mean_size(self.grid))
+        if "suction" in law.state and self.fluid is not None and m.retention is None:
+            raise ValueError(f"{law.__name__}: retention = None, must be a law of retention beside suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
             what = "has unknowns and takes cell_size, must not on a grid of cells of many sizes"
             raise ValueError(f"{law.__name__}: {what}")
@@ -423,6 +426,8 @@ class SceneMaterials:
         for number, law in enumerate(self.laws):
             rows = np.flatnonzero(law_of == number)
             for name, at_rest in law.state.items():
+                if name in DRIED:
+                    continue
                 rest = points.data[name + AT_REST][rows] if name + AT_REST in points.data else at_rest
                 off = np.abs(points.data[name][rows] - np.asarray(rest))
                 out[rows] |= off.max(axis=tuple(range(1, off.ndim)), initial=0.0) > EVOLVED

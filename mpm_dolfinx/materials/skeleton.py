@@ -28,6 +28,9 @@ Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 BY_SCENE = ("dt", "cell_size")
 """What the scene gives to laws: time since the start of the step, s, and mean length of a cell, m."""
 
+DRIED = ("suction", "suction_at_start")
+"""States that the scene sets where a law has them: suction max(-p, 0) at the end of a substep, and as seeded, Pa."""
+
 LOCKING = 0.43
 """Poisson's ratio above which the mean dilatation of a cell is used, at twice the cost of a step.
 
@@ -103,6 +106,9 @@ class Skeleton:
     All of these functions may name `dt`, the time since the start of the step, s: laws of rates, whose state at the end
     of a step has to give its stress at dt = 0.  And `cell_size`, the mean length of a cell of the grid, m: by this what
     softens is made independent of the grid.
+
+    A law that depends on suction has `suction`: 0.0 in its state, and may have `suction_at_start`: 0.0.  The scene sets
+    them: max(-p, 0) at the end of a substep, and as seeded, Pa.  Local unknowns see it as one of the `trial`.
 
     bulk and shear
     are also what the scheme takes its scales from (ghost penalty, fixed-stress coefficient, damping of pressures),

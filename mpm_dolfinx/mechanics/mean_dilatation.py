@@ -128,6 +128,16 @@ class MeanDilatation:
         mean = ufl.tr(tau) / Fbar.ufl_shape[0]
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
+    def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
+        """Return the derivatives by a pressure p, a UFL variable, of both that `_stress` gives."""
+        return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
+
+    def total(
+        self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the cells with pieces that lock, the totals of sums over these, and their volumes (cells, 1)."""
+        return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
+
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives by F and by theta of both results of `_stress`.
 

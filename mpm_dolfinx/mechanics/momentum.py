@@ -14,7 +14,7 @@ derivatives.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 from petsc4py import PETSc
 
@@ -36,6 +36,7 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
+from mpm_dolfinx.mechanics.dried import OfSuction
 from mpm_dolfinx.mechanics.ghost_penalty import GhostPenalty
 from mpm_dolfinx.mechanics.inertia import InertiaForms
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
@@ -102,6 +103,8 @@ class MomentumForms:
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
         """Forms of inertia, None without."""
         self._residuals, self._tangents = [], []
+        dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
+        self._of_suction = OfSuction(grid, self.dilatation) if dried else None
         self._local: dict[int, LocalUnknowns] = {}  # by index of the part
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(
@@ -138,6 +141,10 @@ class MomentumForms:
         """Compile residual and tangent of the integration points of a law."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
+        p = None
+        if self._of_suction is not None and "suction" in law.state:
+            p = ufl.variable(self._retentions.at(pressure, points))
+            values["suction"] = ufl.max_value(-p, 0.0)
         seen = self.dilatation.seen(points, F) if locks else F
         if law.unknowns:
             self._local[number] = local = LocalUnknowns(law, points, seen, values)
@@ -151,6 +158,9 @@ class MomentumForms:
             P, A, beside = self.dilatation.add(law, points, F, seen, ratio, values, known)
         else:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
+        if self._of_suction is not None:
+            stress = partial(self.dilatation.by_pressure, law, F, seen) if locks else partial(_by_pressure, law, F)
+            self._of_suction.add(number, points, F, [] if p is None else stress(values, p), locks)
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
             if self._retentions is not None:
@@ -168,6 +178,10 @@ class MomentumForms:
             self._tangents.append(ElementMatrices(A, points, symmetric, beside))
         else:
             self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
+
+    def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
+        """Return what the forces at (u, p) gain by the cells' pressures through suction, see `OfSuction.rows`."""
+        return [] if self._of_suction is None else self._of_suction.rows(data)
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> NDArray[np.int64]:
         """Set the contents of the owned cells (n,) that are not empty, and the active set: see `GhostPenalty`."""
@@ -250,6 +264,11 @@ class MomentumForms:
         _compat.scatter_reverse_add(shared)
         shared.x.scatter_forward()
         return shared.x.array[:: self.grid.dim] > 0
+
+
+def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
+    """Return the derivative by a pressure p, a UFL variable, of the first Piola-Kirchhoff stress of a law."""
+    return [ufl.diff(law.first_piola(F, values), p)]
 
 
 class MomentumSystem:
@@ -543,6 +562,10 @@ class MomentumProblem:
             for quantity, values in one.outcome(self.at).items():
                 out[quantity] = out.get(quantity, {}) | values
         return out
+
+    def of_suction(self, data: QuadratureData | None = None) -> list[tuple[NDArray, NDArray]]:
+        """Return what the forces gain by the cells' pressures through suction, see `OfSuction.rows`."""
+        return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(
         self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0

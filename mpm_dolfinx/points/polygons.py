@@ -79,13 +79,17 @@ class Polygons:
         kept = np.stack([here & inside, crosses], axis=2).reshape(n, 2 * k)
         return _packed(x, edge, kept)
 
-    def within(self, others: NDArray[np.float64]) -> Polygons:
-        """Return the intersection of each polygon with a convex, anti-clockwise one with vertices (n, m, 2)."""
+    def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
+        """Return the intersection of each polygon with a convex, anti-clockwise one with vertices (n, m, 2).
+
+        near: tolerance, m, within which vertices outside count as inside.
+        """
         out = self
         for k in range(others.shape[1]):
             way = others[:, (k + 1) % others.shape[1]] - others[:, k]
             normal = np.stack([way[:, 1], -way[:, 0]], axis=1)
-            out = out.cut(normal, np.einsum("ni,ni->n", normal, others[:, k]))
+            room = near * np.linalg.norm(normal, axis=1)
+            out = out.cut(normal, np.einsum("ni,ni->n", normal, others[:, k]) + room)
         return out
 
     def simplified(self, near: float) -> Polygons:
@@ -95,27 +99,66 @@ class Polygons:
         return _packed(self.x, self.edge, here & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Return a fan of quadrilaterals about the first vertices.
+        """Divide convex polygons into quadrilaterals, by diagonals with the largest smaller part.
+
+        So no vertex and no direction is preferred.
 
         Returns
         -------
-        The polygon (m,) of each; its vertices (m, 4, 2), of a triangle the last one twice; numbers (m, 4) of its edges.
+        The polygon (m,) of each; its vertices (m, 4, 2), of a triangle with the middle of the longest edge; numbers
+        (m, 4) of its edges.
         """
+        left, rows = self, np.arange(len(self.count))
         found = []
-        for k in range(0, max(0, int(self.count.max(initial=0)) - 2), 2):
-            rows = np.flatnonzero(self.count > k + 2)
-            at = [np.zeros(len(rows), dtype=np.int64), np.full(len(rows), k + 1), np.full(len(rows), k + 2)]
-            at.append(np.minimum(k + 3, self.count[rows] - 1))
-            x = np.stack([self.x[rows, i] for i in at], axis=1)
-            edge = np.stack([self.edge[rows, i] for i in at], axis=1)
-            edge[:, 0] = edge[:, 0] if k == 0 else NONE
-            edge[at[3] == at[2], 2] = NONE
-            edge[at[3] < self.count[rows] - 1, 3] = NONE
-            found.append((rows, x, edge))
+        while len(rows):
+            most = int(left.count.max())
+            at = left.count == most
+            if most > 2:
+                some = Polygons(left.x[at][:, :most], left.count[at], left.edge[at][:, :most])
+                part, beyond = some._divided() if most > 4 else (some, None)
+                found.append((rows[at], *(part._of_four() if part.x.shape[1] == 3 else (part.x, part.edge))))
+                if beyond is not None:
+                    left, rows = left.of(~at)._joined(beyond), np.concatenate([rows[~at], rows[at]])
+                    continue
+            left, rows = left.of(~at), rows[~at]
         if not found:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4), dtype=np.int64)
         rows, x, edge = (np.concatenate(column) for column in zip(*found, strict=True))
         return rows, x, edge
+
+    def _divided(self) -> tuple[Polygons, Polygons]:
+        """Cut a quadrilateral off polygons with the same n > 4 vertices, or a triangle off pentagons; return both."""
+        n = self.x.shape[1]
+        size = 3 if n == 5 else 4
+        whole, best = self.area, None
+        for first in range(n):
+            turned = np.roll(self.x, -first, axis=1)
+            area = Polygons.rings(turned[:, :size]).area
+            least = np.minimum(area, whole - area)
+            if best is None:
+                best, start = least, np.zeros(len(whole), dtype=np.int64)
+            start = np.where(least > best, first, start)
+            best = np.maximum(least, best)
+        order = (start[:, None] + np.arange(n)) % n
+        x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)
+        part, beyond = edge[:, :size].copy(), edge[:, [0, *range(size - 1, n)]]
+        part[:, -1] = beyond[:, 0] = NONE
+        return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], beyond)
+
+    def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return vertices (n, 4, 2) and numbers of edges (n, 4) of triangles, with the middle of the longest edge."""
+        size = np.linalg.norm(self.after - self.x, axis=2)
+        order = (size.argmax(axis=1)[:, None] + np.arange(3)) % 3
+        x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)
+        middle = (x[:, :1] + x[:, 1:2]) / 2
+        return np.concatenate([x[:, :1], middle, x[:, 1:]], axis=1), edge[:, [0, 0, 1, 2]]
+
+    def _joined(self, other: Polygons) -> Polygons:
+        """Return these polygons and others of no more vertices."""
+        more = self.x.shape[1] - other.x.shape[1]
+        x = np.concatenate([self.x, np.pad(other.x, ((0, 0), (0, more), (0, 0)), mode="edge")])
+        edge = np.concatenate([self.edge, np.pad(other.edge, ((0, 0), (0, more)), constant_values=NONE)])
+        return Polygons(x, np.concatenate([self.count, other.count]), edge)
 
 
 def _packed(x: NDArray[np.float64], edge: NDArray[np.int64], kept: NDArray[np.bool_]) -> Polygons:

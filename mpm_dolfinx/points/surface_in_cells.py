@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR, TINY
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
@@ -53,10 +54,7 @@ class Region:
         size = edges + 1 + count
         odd = np.flatnonzero(size % 2)
         after = np.where((np.arange(most) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x[:, :1])
-        after = np.where((np.arange(most) < size[:, None])[:, :, None], after, x)
-        length = np.linalg.norm(after - x, axis=2)[odd]
-        length[:, :edges] = 0.0  # the surface is not divided
-        at = length.argmax(axis=1)
+        at = (edges + size[odd] - 1) // 2  # in the middle of those that are not of the surface
         place = np.arange(most)[None]
         middle = (x[odd, at] + after[odd, at]) / 2
         grown = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)
@@ -70,8 +68,7 @@ class Region:
         self.area = ring.area
         self._middle = ring.centroid
         a, b = x - self._middle[:, None], ring.after - self._middle[:, None]
-        sees = a[:, :, 0] * b[:, :, 1] - a[:, :, 1] * b[:, :, 0]
-        sees = np.where(np.arange(most) < self._size[:, None], sees, 1.0)
+        sees = np.where(np.arange(most) < self._size[:, None], _cross(a, b), 1.0)
         self.sound = (sees.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
@@ -104,11 +101,11 @@ class Region:
 
 
 def resampled(
-    of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64], bulge: NDArray
+    of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return vertices (n, EDGES + 1, 2) of surfaces from P to Q (n, 2), evenly along their parts.
 
-    The area between surface and chord, bulge (n,), is preserved: vertices shift by the lost area.
+    The area between surface and chord is preserved: vertices shift by the lost area.
 
     of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
     """
@@ -119,13 +116,14 @@ def resampled(
     out = np.concatenate([P[:, None], np.zeros((len(P), EDGES - 1, 2)), Q[:, None]], axis=1)
     at = np.zeros((len(P), EDGES + 1))
     at[:, 0], at[:, -1] = ends
+    joint = (x[:, 0] + np.roll(x[:, 1], 1, axis=0)) / 2  # parts may gape a little
 
     def divide(low: int, high: int) -> None:
         """Put a vertex between two others: at the sharpest corner, or in the middle of a nearly straight part."""
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
-        off = x[:, 0] - a[of]
-        far = np.abs(chord[of, 0] * off[:, 1] - chord[of, 1] * off[:, 0])
+        off = joint - a[of]
+        far = np.abs(_cross(chord[of], off))
         far /= np.maximum(np.linalg.norm(chord, axis=1), TINY)[of]
         within = (gone[:-1] > at[of, low]) & (gone[:-1] < at[of, high])
         far = np.where(within, far, 0.0)
@@ -133,24 +131,36 @@ def resampled(
         corner = order[stop - 1]
         aim = (at[:, low] + at[:, high]) / 2
         aim = np.where(far[corner] > BENT, gone[corner], aim)
+        at[:, middle] = aim
+        out[:, middle] = (place(aim - NEAR) + place(aim + NEAR)) / 2  # alike from both ends
+
+    def place(aim: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the places (n, 2) so far, in cells, along the parts."""
         part = np.clip(np.searchsorted(gone, aim, side="right") - 1, first, stop - 1)
         t = (aim - gone[part]) / np.maximum(length[part], TINY)
-        at[:, middle] = aim
-        out[:, middle] = x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
+        return x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
 
     step = EDGES
     while step > 1:
         for low in range(0, EDGES, step):
             divide(low, low + step)
         step //= 2
+    a, b = x.transpose(1, 0, 2) - P[of]
+    gap = (of[1:] == of[:-1])[:, None] * (a[1:] - b[:-1])
+    bulge = sum_by(of, _cross(a, b), len(P)) + sum_by(of[1:], _cross(b[:-1], gap), len(P))
     y = out - P[:, None]
-    has = (y[:, :-1, 0] * y[:, 1:, 1] - y[:, :-1, 1] * y[:, 1:, 0]).sum(axis=1) / 2
+    has = _cross(y[:, :-1], y[:, 1:]).sum(axis=1)
     way = out[:, 2:] - out[:, :-2]
     normal = np.stack([way[:, :, 1], -way[:, :, 0]], axis=2)
     size = np.maximum(np.linalg.norm(way, axis=2), TINY)
-    shift = 2 * (bulge - has) / size.sum(axis=1)
+    shift = (bulge - has) / size.sum(axis=1)
     out[:, 1:-1] += shift[:, None, None] * normal / size[:, :, None]
     return np.clip(out, 0.0, 1.0)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cross products (...) of vectors (..., 2): twice the area between them."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -216,6 +216,11 @@ def _value(function: Callable, p: float) -> float:
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
+def chi_at(law, p: float) -> float:
+    """Return chi, the share of a pressure p, Pa, that the skeleton feels by a law."""
+    return _value(partial(property_of, law, "bishop"), p)
+
+
 def _empty(function: Callable, suction: float) -> bool:
     """Return whether a function of p has fallen to a half at a suction, Pa, or is no number there."""
     try:
@@ -290,6 +295,10 @@ class Retentions:
         """Return by how much pressures at levers (m, d), m, differ from those of cells (m,), Pa."""
         return lever @ self.weight.value
 
+    def at(self, p, points: FormPoints):
+        """Return the pressures of points in cells of pressures p, Pa, as UFL."""
+        return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
+
     def of(self, name: str, p, points: FormPoints):
         """Return a property of the pores of points in cells of pressures p, Pa, as UFL.
 
@@ -301,8 +310,7 @@ class Retentions:
             They have the fields retention and, as pieces, lever.
         """
         row = points.retention
-        if "lever" in points.sizes:
-            p = p + ufl.dot(self.weight, points.lever)
+        p = self.at(p, points)
         values = [
             property_of(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first
         ]

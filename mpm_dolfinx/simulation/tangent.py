@@ -80,7 +80,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     blocks |= dict(zip(("nodes", "components"), unknowns.nodes, strict=True))
     if storage is not None:
         storage.assemble_residual()
-        storage.assemble_tangent()
+        storage.assemble_tangent(of_suction=momentum.of_suction())
         of = storage.system
         blocks |= {"pressure": -_csr(of.B_momentum).T.tocsr(), "content": _csr(of.B), "storage": _csr(of.C)}
         blocks["cells"] = of.unknowns.owned.copy()

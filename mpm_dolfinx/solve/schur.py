@@ -198,7 +198,7 @@ class LinearSolvers:
             if first and not self.plan.symmetric and self.du.comm.size == 1:
                 renew(self._momentum.K)
             if storage is not None:
-                storage.assemble_tangent(data and data.pieces)
+                storage.assemble_tangent(data and data.pieces, momentum.of_suction(data))
         with Timer("mpm: factorisation"), using(self.scheme.petsc_options, self._unread):
             if storage is None:
                 self.solve_u.setUp()
@@ -303,6 +303,8 @@ class LinearSolvers:
 
     def restrain(self, storage: StorageProblem, went: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
         """Limit the fall of pressures along the direction as the storage requires, and adapt the displacements."""
+        if not storage.forms.retains:
+            return went
         dp, went = storage.restrained(self.dp.array_r, went)
         far = not np.array_equal(dp, self.dp.array_r)
         if self.du.comm.tompi4py().allreduce(far, MPI.LOR):

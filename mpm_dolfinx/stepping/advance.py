@@ -138,6 +138,7 @@ class Motion:
                 part, count = on_grid.parts
                 moved = np.where(keeps & stays, 0.0, cut.moved(points, part, count)[part])
                 points = replace(points, data=points.data | carried(moved))
+            points = self._dried(points, on_grid, data)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
             carried = None
             if self._storage is not None:
@@ -202,9 +203,18 @@ class Motion:
     def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
         """Return points with F and state after a solved step of zero length, at unchanged positions."""
         nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
-        after = points.strained(self._deformed(on_grid.cut, data, nodal))
+        after = self._dried(points.strained(self._deformed(on_grid.cut, data, nodal)), on_grid, data)
         self._check_volumes(after, on_grid.cut)
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
+
+    def _dried(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
+        """Return points with the suction of their pieces, which are means over them, where laws see it."""
+        if self._storage is None or "suction" not in self._materials.state_names:
+            return points
+        cut, pieces = on_grid.cut, data.pieces
+        p = self._storage.p.x.array[pieces.cells] + self._materials.retentions.heads(pieces["lever"])
+        mean = cut.mean(cut.to_pieces(np.maximum(-p, 0.0)[:, None]))[:, 0]
+        return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the mean of Delta F over the pieces, with the mean of det.

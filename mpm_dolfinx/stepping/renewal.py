@@ -9,15 +9,16 @@ filled anew:
 * a cell that the surface crosses once with quadrilaterals about the centroid of the filled part. The surface there
   becomes `EDGES` edges, with the same ends, area and sharp corners.
 
-The parts of old domains outside these cells are cut off and kept. Masses and volumes are exact in each cell. The
-logarithm of the elastic left Cauchy-Green tensor, and other data of points, are mass means over the overlap. Fitted
-slopes shift them to the new centroids, within the range of values: they are of second order. Cells with elastic soil,
-several bodies, prescribed displacements, or several crossings of the surface are left alone.
+The parts of old domains outside these cells are cut off and kept. Masses, volumes and the mass of the fluid are exact
+in each cell. So are sums by mass of other data of points, the logarithm of the elastic left Cauchy-Green tensor among
+them: means over the overlap, shifted to the new centroids by fitted slopes, within the range of values. Cells with
+elastic soil, several bodies, prescribed displacements, or several crossings of the surface are left alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 from mpi4py import MPI
@@ -27,16 +28,18 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.fluid_content import pressure_of
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import FACES, centroids, volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space
-from mpm_dolfinx.stepping.stage import Stage
+from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
 """Largest length of a domain in cells: longer ones would bend, but their edges are straight. Source: definition."""
@@ -93,55 +96,91 @@ class Renewal:
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
-    def _free(self, points: MaterialPoints, watched: NDArray[np.int64] | None) -> NDArray[np.bool_]:
-        """Return the points (n,) that may be renewed."""
-        flowed = self.flowed(points)
-        return flowed if watched is None else flowed & ~np.isin(points.id, watched)
+    def _free(self, state: State) -> NDArray[np.bool_]:
+        """Return the points (n,) that may be renewed: without probes, and not in a part of the bodies that rests."""
+        free = self.flowed(state.points)
+        if state.watched is not None:
+            free &= ~np.isin(state.points.id, state.watched)
+        return free if state.stay is None else free & ~state.stay.keeps
 
-    def renewed(
-        self, points: MaterialPoints, stage: Stage, watched: NDArray[np.int64] | None = None
-    ) -> tuple[MaterialPoints, int]:
-        """Return the points with renewed domains, and the number of replaced ones. The call is collective.
+    def renewed(self, state: State) -> tuple[State, int]:
+        """Return the state with renewed domains, and the number of replaced ones. The call is collective.
 
         After a renewal the first process has all points. A failure raises NotConverged on all processes.
-
-        Parameters
-        ----------
-        points
-            The points of this process.
-        stage
-            The active conditions.
-        watched : (m,)
-            Numbers of points that may not be renewed.
         """
         comm = self._grid.comm
-        free = self._free(points, watched)
-        if not over_all(comm, int((free & self.long(points)).any())):
-            return points, 0
+        free = self._free(state)
+        if not over_all(comm, int((free & self.long(state.points)).any())):
+            return state, 0
         if comm.size > 1:
-            points = points.migrated(Exchange(comm, np.zeros(len(points), dtype=np.int32)))
-            free = self._free(points, watched)
-        made, count = points, 0
+            state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
+            free = self._free(state)
+        made, count = state, 0
         message = ""
         try:
             if comm.rank == 0:
-                made, count = self._renewed(points, stage, free)
+                made, count = self._renewed(state, free)
         except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised on all below
             message = str(error)
         if message := first(comm, message):
             raise NotConverged(f"renewal of domains: {message}")
         count = over_all(comm, count)
-        return (with_faces(made) if count else made), count
+        if not count:
+            return state, 0
+        stay = made.stay and replace(made.stay, points=with_faces(made.stay.points))
+        return replace(made, points=with_faces(made.points), stay=stay), count
 
-    def _renewed(self, points: MaterialPoints, stage: Stage, free: NDArray[np.bool_]) -> tuple[MaterialPoints, int]:
+    def _renewed(self, state: State, free: NDArray[np.bool_]) -> tuple[State, int]:
+        stage, points = state.stage, state.points
         held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
         signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs)
         if not work.chosen.any():
-            return points, 0
+            return state, 0
         new = [work.full(), work.partial(), work.rest]
-        return self._filled(points, work, new, touched)
+        group = np.concatenate([one.group for one in new])
+        made = self._filled(points, work, new, touched)
+        kept = ~work.gone
+        gone = points.id[work.gone]
+        stay, pieces = state.stay, state.pieces
+        if stay is not None:
+            rows = _joined(stay.points, made, kept)
+            order = np.argsort(np.concatenate([points.id[kept], made.id]))
+            stay = Stay(rows, np.concatenate([stay.keeps[kept], np.zeros(len(made), dtype=bool)])[order])
+        if pieces is not None:
+            pressure = self._pressures(pieces, points, work, made, group)
+            brought = at_start(replace(made, pressure=pressure))
+            if pieces.of_cell is not None:
+                brought = replace(brought, of_cell=pressure, start=pressure)
+            pieces = pieces.of(gone, kept=False).joined(brought)
+        return replace(state, points=_joined(points, made, kept), pieces=pieces, stay=stay), len(gone)
+
+    def _pressures(
+        self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
+    ) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, of new domains, which give their cells the fluid of the old ones.
+
+        They are means in each group, (m,) of the new domains: by storage, or by volume if nothing is stored.
+        """
+        materials, pieces = self._materials, work.pieces
+        bulk = materials.fluid.bulk
+        there = transport(old.potentials(bulk), points, pieces)
+        piece, groups, share = work.into
+        of, count = pieces.point[piece], int(group.max()) + 1
+        lost = pieces.fraction.copy()
+        lost[piece] = 0.0  # slivers, which go to the others of their domain
+        whole, held = (sum_by(pieces.point, lost * values, len(points)) for values in (1.0, there))
+        mean = np.divide(held, whole, out=np.zeros(len(points)), where=whole > 0)[of]
+        brings = pieces.fraction[piece] * there[piece] + (share - pieces.fraction[piece]) * mean
+
+        def over(values: NDArray, weight: NDArray) -> NDArray:
+            return sum_by(groups, values * weight[of], count)
+
+        volume, store = (of * points.volume0 * points.J for of in (1.0, materials.storage(points)))
+        even = over(brings, volume) / over(share, volume)
+        stored = sum_by(group, materials.storage(made) * made.volume0 * made.J, count)
+        return pressure_of(np.divide(over(brings, store), stored, out=even, where=stored > 0), bulk)[group]
 
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
@@ -163,10 +202,12 @@ class Renewal:
 
     def _filled(
         self, points: MaterialPoints, work: RefilledCells, new: Sequence[New], touched: Sequence[str]
-    ) -> tuple[MaterialPoints, int]:
-        """Return the points with new domains in place of the old ones."""
+    ) -> MaterialPoints:
+        """Return the points of the new domains."""
         corners, group, parent, area, ends = (np.concatenate(column) for column in zip(*new, strict=True))
-        old, at, share, of_group = work.pairs(corners, group)
+        old, at, share = work.pairs(corners, group)
+        piece, groups, part = work.into
+        gone = work.pieces.point[piece]
         n, mass = len(corners), points.volume0
         J = points.J
         weight = share * mass[old]
@@ -175,29 +216,40 @@ class Renewal:
         x = centroids(corners)
         off = x - np.stack([sum_by(at, weight * column, n) / total for column in points.x[old].T], axis=1)
 
-        def mean(values: NDArray) -> NDArray:
-            flat = values[old].reshape(len(old), int(np.prod(values.shape[1:])))
-            sums = [sum_by(at, weight * column, n) / total for column in flat.T]
-            if not sums:
-                return np.zeros((n, *values.shape[1:]))
-            rise = work.rise(values.reshape(len(values), flat.shape[1]), group)
-            low, high = np.full((n, flat.shape[1]), np.inf), np.full((n, flat.shape[1]), -np.inf)
-            np.minimum.at(low, at, flat)
-            np.maximum.at(high, at, flat)
-            means = np.stack(sums, axis=1)
-            means = np.clip(means + np.einsum("ni,nik->nk", off, rise), low, high)
-            return means.reshape(n, *values.shape[1:])
-
         size = np.abs(volumes(corners))
         count = int(group.max()) + 1
-        gone, groups, part = of_group
         M, V = (sum_by(groups, part * of[gone], count) for of in (mass, mass * J))
         A = sum_by(group, size, count)
+
+        def mean(values: NDArray) -> NDArray:
+            flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+            if not flat.shape[1]:
+                return np.zeros((n, *values.shape[1:]))
+            means = np.stack([sum_by(at, weight * column, n) / total for column in flat[old].T], axis=1)
+            means = means + np.einsum("ni,nik->nk", off, work.rise(flat, group))
+            low, high = np.full((count, flat.shape[1]), np.inf), np.full((count, flat.shape[1]), -np.inf)
+            np.minimum.at(low, groups, flat[gone])
+            np.maximum.at(high, groups, flat[gone])
+            return np.clip(means, low[group], high[group]).reshape(n, *values.shape[1:])
+
         like = np.exp(mean(np.log(J)))
         scale = V / M * sum_by(group, size / like, count) / A  # mass and volume are both exact
         ratio = like * scale[group]
         volume0 = V[group] * size / A[group] / ratio
-        gone_rows = np.unique(gone)
+
+        def kept(values: NDArray) -> NDArray:
+            """Return means whose sum by mass is exact, too: the room that is left within the values is shared."""
+            means = mean(values).reshape(n, -1)
+            for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
+                missing = sum_by(groups, part * (mass * of)[gone], count) - sum_by(group, volume0 * column, count)
+                end = np.full(count, np.inf), np.full(count, -np.inf)
+                np.minimum.at(end[0], groups, of[gone])
+                np.maximum.at(end[1], groups, of[gone])
+                room = np.where(missing > 0, end[1], end[0])[group] - column
+                whole = sum_by(group, volume0 * room, count)
+                column += np.divide(missing, whole, out=np.zeros(count), where=whole != 0)[group] * room
+            return means.reshape(n, *values.shape[1:])
+
         material = np.zeros(n, dtype=points.material.dtype)
         material[at] = points.material[old]
         body = np.zeros(n, dtype=np.int64)
@@ -206,37 +258,32 @@ class Renewal:
         d = points.F.shape[1]
         F = ratio[:, None, None] ** (1 / d) * np.eye(d)
         data = {}
-        log = _log(self._elastic(points, gone_rows))
         logs = np.zeros((len(points), 3, 3))
-        logs[gone_rows] = log
+        logs[work.gone] = _log(self._elastic(points, np.flatnonzero(work.gone)))
         across = np.exp(mean(np.log(points.data[ACROSS]))) if ACROSS in points.data else None
-        data["plastic"] = _pulled(F, across, _exp(mean(logs)))
+        data["plastic"] = _pulled(F, across, _exp(kept(logs)))
         for name, values in points.data.items():
             if name in touched:
                 data[name] = work.on_faces(values, corners, parent, group, points)
             elif name == ACROSS:
                 data[name] = across
             elif name not in (PARENT, AREA, ENDS, "plastic"):
-                data[name] = mean(values)
+                data[name] = kept(values)
         data |= {PARENT: parent, AREA: area, ENDS: ends}
         used = points.id[points.id >= self._starts[-1]]
         number = (used.max(initial=self._starts[-1] - 1) - self._starts[-1]) // len(self._bodies) + 1
-        made = MaterialPoints(
+        return MaterialPoints(
             id=self._starts[-1] + body + len(self._bodies) * (number + np.arange(n)),
             corners=corners,
             F=F,
             volume0=volume0,
             material=material,
-            pressure=mean(points.pressure),
+            pressure=kept(points.pressure),
             x=x,
             origin=corners - moved[:, None],
             reference=x[:, None] + (corners - x[:, None]) / ratio[:, None, None] ** 0.5,
             data=data,
         )
-        kept = np.ones(len(points), dtype=bool)
-        kept[gone_rows] = False
-        stay = with_faces(points).map(lambda rows: rows[kept])
-        return stay.joined(made), len(gone_rows)
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points `rows`."""
@@ -244,6 +291,11 @@ class Renewal:
         seen = points.F_of_laws[rows]
         F[:, : seen.shape[1], : seen.shape[1]] = seen
         return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
+
+
+def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
+    """Return those points that are kept (n,), and new ones."""
+    return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 
 def _log(b: NDArray[np.float64]) -> NDArray[np.float64]:

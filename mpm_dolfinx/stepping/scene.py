@@ -149,7 +149,7 @@ class Scene:
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
-        self._renewed: Latest[tuple[MaterialPoints, int]] = Latest()
+        self._renewed: Latest[tuple[dict[str, Any], int]] = Latest()
         _ = self._renewal  # refuses scenes without support for it
 
     @property
@@ -250,14 +250,14 @@ class Scene:
             "is axisymmetric": grid.axisymmetric,
             "has cells of many sizes": not grid.even,
             "has groups in contact": grid.copies > 1,
-            "has a fluid": self.fluid is not None,
+            "has pores that drain": self.materials.drains or self.materials.retentions is not None,
             "has inertia": self.momentum.inertia is not None,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
-            raise ValueError(f"{what}, must be of dry soil that yields, in plane strain on equal cells")
+            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain on equal cells")
         return Renewal(grid, self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
@@ -265,15 +265,19 @@ class Scene:
 
         renew: whether renewal is allowed.
         """
-        if self._renewal is None or state.stay is not None or not renew:
+        if self._renewal is None or not renew:
             return state.at_owners(self.grid), 0
 
-        def make() -> tuple[MaterialPoints, int]:
+        def make() -> tuple[dict[str, Any], int]:
             with Timer("mpm: renew domains"):
-                return self._renewal.renewed(state.points, state.stage, state.watched)
+                new, count = self._renewal.renewed(state)
+            return {name: getattr(new, name) for name in ("points", "pieces", "stay") if count}, count
 
-        points, count = self._renewed((*state.points.arrays, state.stage), make, self.grid.comm)
-        return (replace(state, points=points) if count else state).at_owners(self.grid), count
+        pieces, stay = state.pieces, state.stay
+        key = (*state.points.arrays, state.stage, state.watched, stay and stay.keeps)
+        key = key if pieces is None else (*key, *pieces.arrays.values())
+        new, count = self._renewed(key, make, self.grid.comm)
+        return replace(state, **new).at_owners(self.grid), count
 
     def assembled(
         self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -18,9 +18,19 @@ from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ROUND_OFF
 from mpm_dolfinx.base.validation import instance, numbers, whole
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
-from mpm_dolfinx.materials.skeleton import Skeleton
+from mpm_dolfinx.materials.skeleton import DRIED, Skeleton
+from mpm_dolfinx.pores.retention import chi_at
 
-KINDS = ("isotropic", "oedometer", "triaxial drained", "triaxial undrained", "shear drained", "shear undrained")
+WETTING = ("wetting isotropic", "wetting oedometer")
+KINDS = (
+    "isotropic",
+    "oedometer",
+    "triaxial drained",
+    "triaxial undrained",
+    "shear drained",
+    "shear undrained",
+    *WETTING,
+)
 AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
 ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # of Newton's method; relative accuracy
 
@@ -32,7 +42,7 @@ class ElementTest:
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.
     strain : (n,)
-        What is driven: logarithmic axial strain, compression positive; shear F_xy in shear.
+        What is driven: logarithmic axial strain, compression positive; shear F_xy in shear; suction, Pa, in wetting.
     pressure : (n,), Pa
         Excess pore pressure: zero where drained.
     state
@@ -90,6 +100,7 @@ def element_test(
     confinement: float = 0.0,
     rate: float | None = None,
     cell_size: float | None = None,
+    suction: float = 0.0,
 ) -> ElementTest:
     """Drive a law through a laboratory test.
 
@@ -100,10 +111,11 @@ def element_test(
     test
         One of `ElementTest.KINDS`: "isotropic", "oedometer" (no lateral strain), "triaxial drained" (constant lateral
         stress), "triaxial undrained" (constant volume and lateral total stress), "shear drained" (simple, at constant
-        normal stress, F_xx = F_zz = 1), "shear undrained" (simple, at constant volume).
+        normal stress, F_xx = F_zz = 1), "shear undrained" (simple, at constant volume), "wetting isotropic" and
+        "wetting oedometer" (constant net stresses, along all axes or axial, without lateral strain).
     strain
         Where it goes, or the turning points on the way: logarithmic axial strain, compression positive, in an
-        isotropic test of each axis; in shear F_xy.
+        isotropic test of each axis; in shear F_xy; in wetting suctions, Pa, >= 0.
     steps
         Equal steps to each turning point.
     confinement
@@ -113,6 +125,8 @@ def element_test(
         Strain in a second, 1/s, > 0, of laws that depend on the time step.
     cell_size
         Size of the cells, m, > 0, of laws that depend on it.
+    suction
+        Suction at the start, Pa, >= 0, of laws that depend on it; in all tests but wetting it stays.
 
     Raises
     ------
@@ -124,7 +138,13 @@ def element_test(
     instance("material", material, Skeleton)
     if test not in KINDS:
         raise ValueError(f"test = {test!r}, must be one of {', '.join(KINDS)}")
+    wets = test in WETTING
     ends = numbers("strain", strain, None, allowed="a finite number, or several").ravel()
+    suction = float(numbers("suction", suction, allowed=">= 0 Pa and finite", test=_not_negative))
+    if wets:
+        numbers("strain", ends, (len(ends),), allowed="suctions >= 0 Pa in wetting", test=_not_negative)
+        if material.retention is None:
+            raise ValueError(f"{type(material).__name__}: retention = None, must be a law of retention in wetting")
     confinement = float(numbers("confinement", confinement, allowed=">= 0 Pa and finite", test=_not_negative))
     for name, value in (("rate", rate), ("cell_size", cell_size)):
         if value is not None:
@@ -133,9 +153,11 @@ def element_test(
             raise ValueError(f"{name} is not given, must be > 0: {type(material).__name__} depends on it")
     if cell_size is not None:
         material.check_cells(cell_size)
-    steps, point = whole("steps", steps), _Point(material, rate, cell_size)
+    steps, point = whole("steps", steps), _Point(material, rate, cell_size, suction)
     start = point.compressed(confinement) if confinement else point.at_rest()
-    path = np.concatenate([np.linspace(a, b, steps + 1)[1:] for a, b in zip([0.0, *ends], ends, strict=False)])
+    first = suction if wets else 0.0
+    start = replace(start, strain=first)
+    path = np.concatenate([np.linspace(a, b, steps + 1)[1:] for a, b in zip([first, *ends], ends, strict=False)])
     out = [start]
     for goal in path:
         out.append(point.moved(out[-1], test, start, goal))
@@ -143,7 +165,7 @@ def element_test(
     F, stress = (np.array([getattr(s, name) for s in out]) for name in ("F", "stress"))
     # undrained, the total stress on the cell's wall, and in shear the total normal stress, stays
     pressure = (stress - stress[0])[:, 1, 1] * test.endswith("undrained")
-    return ElementTest(F, stress, np.array([0.0, *path]), pressure, states)
+    return ElementTest(F, stress, np.array([first, *path]), pressure, states)
 
 
 def _not_negative(v) -> NDArray[np.bool_]:
@@ -163,13 +185,15 @@ class _At:
 class _Point:
     """A law at a single point."""
 
-    def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None):
+    def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None, suction: float):
         self._rate, law = rate or 1.0, type(material)
+        self._material = material
         for field in fields(material):
             if callable(getattr(material, field.name)) and field.name not in ("conductivity_law", "retention"):
                 raise ValueError(f"{law.__name__}: {field.name} is a function, must be a number in an element test")
         self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
+        self._rest |= {name: np.asarray(suction) for name in DRIED if name in law.state}
         shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
         self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size=cell_size)
         self._bulk = float(material.bulk)
@@ -220,6 +244,8 @@ class _Point:
     def _step(self, at: _At, test: str, start: _At, strain: float) -> _At:
         kind, _, drainage = test.partition(" ")
         F, dt = at.F.copy(), abs(strain - at.strain) / self._rate
+        if kind == "wetting":
+            return self._wetted(at, start, strain, [*LATERAL, AXIAL] if drainage == "isotropic" else [AXIAL], dt)
         if kind == "shear":
             F[SHEAR] = start.F[1, 1] * strain
             free = [(1, 1)] if drainage == "drained" else []
@@ -233,6 +259,14 @@ class _Point:
                 F[axis] = start.F[axis] / np.sqrt(stretch)
         free = list(LATERAL) if drainage == "drained" else []
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
+
+    def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
+        """Return the soil at another suction, Pa, where the free components of the net stress stay."""
+        m = self._material
+        felt, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
+        goal = [start.stress[i] + before - felt for i in free]
+        state = at.state | ({DRIED[0]: np.asarray(suction)} if DRIED[0] in at.state else {})
+        return self._balanced(replace(at, state=state), at.F, free, goal, suction, dt)
 
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float

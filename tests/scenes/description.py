@@ -83,7 +83,7 @@ class Scene:
     cells, h : (d,), -, m — of the grid, which begins at the origin; materials: name of the law, its constants;
     initial: stress at rest, None or "K0" or "given", with `ratio` and `surcharge`, Pa; level: of the water table, m;
     contact: friction between the last body and the others; rate: of a source, 1/s; stiffness: of springs in the bodies,
-    N/m^4; uneven: whether grid lines lie at random.
+    N/m^4; uneven: whether grid lines lie at random; renewal: whether domains of yielded soil are renewed.
     """
 
     seed: int
@@ -111,6 +111,7 @@ class Scene:
     stage: Stage | None = None
     tolerance: float = 1e-11
     uneven: bool = False
+    renewal: bool = False
 
     @property
     def dim(self) -> int:

@@ -14,6 +14,8 @@ from helpers import without
 from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.points.cutting import centroids
+from mpm_dolfinx.points.material_points import body_of
 from scenes.description import FAR, WATER, Condition, G, RigidTool, Scene
 from scenes.frames import Frame
 from scenes.meshes import mesh_of
@@ -151,9 +153,13 @@ class _Builder:
         frame, given = self.frame, dict(constants)
         if given.pop("kozeny_carman", False):
             given["conductivity_law"] = mpm.kozeny_carman
-        for name in ("bulk", "shear", "cohesion", "residual"):
+        for name in ("bulk", "shear", "cohesion", "residual", "reference"):
             if name in given:
                 given[name] *= frame.stress
+        if "beta" in given:
+            given["beta"] /= frame.stress
+        if "entry" in given:
+            given["retention"] = mpm.VanGenuchten(given.pop("entry") * frame.stress, n=1.8)
         if "initial_stress" in given:
             given["initial_stress"] = tuple(frame.stress * s for s in given["initial_stress"])
         if "slip" in given:
@@ -292,7 +298,7 @@ class _Builder:
 
     def options(self, later: list[int]) -> dict:
         scene, frame = self.scene, self.frame
-        out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance)}
+        out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance, renewal=scene.renewal)}
         down = np.zeros(scene.dim)
         down[-1] = -scene.gravity * frame.length / frame.time**2
         if scene.gravity:
@@ -325,7 +331,7 @@ class _Builder:
 class Shown:
     """What a scene shows at a time, in the frame of its description; arrays over its points by places at rest.
 
-    steps: that the run took so far; where some are cut there are more.
+    Where domains are renewed places are those now.  steps: that the run took so far; where some are cut there are more.
     """
 
     place: NDArray[np.float64]
@@ -337,13 +343,16 @@ def shown(built: Built) -> Shown:
     """Return what a simulation shows now."""
     scene, frame, s = built.scene, built.frame, built.simulation
     points, d = s.points, scene.dim
-    start = np.cumsum([0, *map(len, s.bodies)])
-    number = np.searchsorted(start, points.id, side="right") - 1
+    number = body_of(points.id, np.cumsum([0, *map(len, s.bodies)]))
     own = np.isin(number, built.order[: len(scene.bodies)])
-    places = np.concatenate([body.corners().mean(axis=1) for body in s.bodies])[points.id][own]
+    if scene.renewal:  # points are others than those at rest
+        places, rest = points.x[own], centroids(points.origin[own])
+    else:
+        rest = points.origin[own].mean(axis=1)
+        places = np.concatenate([body.corners().mean(axis=1) for body in s.bodies])[points.id][own]
     stress = s.point_fields().effective_stress[own]
     fields = {
-        "displacement": frame.vector_back((points.x - points.origin.mean(axis=1))[own] / frame.length),
+        "displacement": frame.vector_back((points.x[own] - rest) / frame.length),
         "stress": frame.tensor_back(stress / frame.stress),
         "volume": points.J[own] - 1,
     }

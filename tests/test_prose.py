@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: MIT
+"""The English of pages and docstrings: vague words and long sentences only become fewer."""
+
+import pytest
+
+from tests import prose
+
+CEILINGS = {  # vague words in 1000, and long sentences in 100: lowered with what is rewritten
+    "package": (4.8, 1.4),
+    "demos": (0.5, 2.0),
+    "front page": (0.5, 2.0),
+    "demos page": (0.5, 2.0),
+    "method page": (0.5, 2.0),
+}
+
+
+@pytest.mark.parametrize("part", prose.PARTS)
+def test_prose_is_not_above_its_ceiling(part):
+    found, (vague, long) = prose.measures(prose.PARTS[part]()), CEILINGS[part]
+    assert found["words"] > 500
+    assert found["vague"] <= vague and found["long"] <= long and found["median"] <= 14
+
+
+def test_vague_words_and_long_sentences_are_counted():
+    long = " ".join(["word"] * 26)
+    texts = prose.paragraphs(f"What stands beside `those` names: three.\n\n* {long}. Of which\n* a short one.")
+    found = prose.measures(texts)
+    assert (
+        found["words"] == 37 and found["vague"] == pytest.approx(3000 / 37) and found["long"] == pytest.approx(100 / 3)
+    )
+    assert len(prose.poor(texts)) == 4
