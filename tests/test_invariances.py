@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from scenes.balancing import ROUNDED, Ledger, balanced, held_by_conditions
 from scenes.comparing import differences, resolved
-from scenes.description import ELASTIC, Block, Condition, RigidTool, Scene, drawn
+from scenes.description import ELASTIC, Block, Condition, RigidTool, Scene, draining, drawn
 from scenes.frames import Frame, composite
 from scenes.running import counted, run
 
@@ -146,6 +146,16 @@ def test_many_scenes_show_the_same_in_any_frame():
     start, stop = map(int, os.environ.get("INVARIANCE_SEEDS", "1000:2000").split(":"))
     count = reported((drawn(seed) for seed in range(start, stop)), float(os.environ.get("INVARIANCE_SECONDS", "inf")))
     assert not count["differs"], count
+
+
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 43), marks=pytest.mark.slow)], ids=["few", "many"])
+def test_scenes_whose_pores_drain_show_the_same_in_any_frame(seeds):
+    """INVARIANCE_SEEDS=1000:2000 says which many."""
+    if len(seeds) > 3 and "INVARIANCE_SEEDS" in os.environ:
+        seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
+    small = {"dim": 2, "laws": LAWS[0]} if len(seeds) == 3 else {}
+    count = reported(draining(seed, **small) for seed in seeds)
+    assert not count["differs"] and count["same"], count
 
 
 @pytest.mark.skipif("INVARIANCE_SEED" not in os.environ, reason="asks for a seed")

@@ -26,23 +26,27 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes"
+NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes rain"
 NAMES = NAMES.split()
 SCENES = [f"mpi_{name}.py" for name in NAMES] + [pytest.param("mpi_wetting.py", marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
+@pytest.mark.parametrize(
+    "scene, several",
+    [*((scene, (3,)) for scene in SCENES), pytest.param("mpi_rain.py", (2, 4), marks=pytest.mark.slow)],
+)
+def test_the_state_is_the_same_on_several_processes(scene, several, tmp_path):
     states = []
-    for processes in (1, 3):
+    for processes in (1, *several):
         file = tmp_path / f"{processes}.npz"
         mpirun(processes, scene, str(file))
         states.append(np.load(file))
         assert len(states[-1]["counts"]) == processes and states[-1]["balance"] <= 1e-8
-    one, three = states
-    assert three["x"] == pytest.approx(one["x"], abs=1e-10)
-    for name in set(three.files) - {"x", "tip", "balance", "counts"}:
-        assert three[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max())
+    one, *others = states
+    for other in others:
+        assert other["x"] == pytest.approx(one["x"], abs=1e-10)
+        for name in set(other.files) - {"x", "tip", "balance", "counts"}:
+            assert other[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max())
 
 
 def test_a_demo_of_several_processes_prints_what_one_does_or_is_refused(tmp_path, capsys, monkeypatch):

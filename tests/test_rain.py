@@ -3,6 +3,8 @@
 
 import numpy as np
 import pytest
+import rain
+import ufl
 from test_unsaturated import STIFF, WATER, column, water
 
 import mpm_dolfinx as mpm
@@ -217,3 +219,62 @@ def test_rain_on_two_soils_is_the_same_in_any_frame(other):
     expected = two_soils_in_the_rain()
     for found, value in zip(two_soils_in_the_rain(**other), expected, strict=True):
         assert found == pytest.approx(value, abs=1e-8 * np.abs(value).max())
+
+
+def test_a_long_slope_under_steady_rain_is_as_safe_as_its_suction_says():
+    """Dry, and at nine tenths of the conductivity: factors at 1, 2, 3 and 5 m, by the pressures found."""
+    known = {
+        0.0: (1.1636053, 1.0462666, 1.0145471, 0.9397027),
+        0.9: (1.1739380, 1.0324996, 0.9845665, 0.9397027),
+    }
+    s = rain.column(20)
+    for days, (share, factors) in zip((0, 20), known.items(), strict=True):
+        if days:
+            s.run(days * rain.DAY, 2 * rain.DAY, progress=False)
+        depth, _, felt = rain.found(s)
+        at = np.interp(rain.DEPTHS, np.append(depth, rain.TABLE), np.append(felt, 0.0))
+        assert rain.safety(rain.DEPTHS, at) == pytest.approx(factors, rel=1e-3)
+        assert rain.exact(rain.DEPTHS, share) == pytest.approx(factors, rel=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth, share, cells", [(3.0, 0.0, 8), (3.0, 0.9, 8), (1.0, 0.0, 20), (1.0, 0.9, 20)])
+def test_a_long_slope_slides_when_its_strength_is_divided_by_its_factor(depth, share, cells):
+    """A column that may only shear along the slope, its foot at a depth: strength reduction, suction and weight of it.
+
+    Flow is associated, so the exact factor is that of limit analysis, c' + (sigma + chi s) tan phi over tau.
+    """
+    steep, alpha = np.cos(rain.SLOPE), rain.ALPHA
+    height = depth * steep
+    h = height / cells
+    grid = mpm.Grid([0, 0], [3 * h, height + 2 * h], [3, cells + 2])
+    law = {"conductivity": rain.K, "retention": mpm.Gardner(WATER / alpha), "porosity": 0.35}
+    angles = {"friction": 32.0, "dilation": 32.0, "cohesion": rain.COHESION}
+    soil = mpm.MohrCoulomb(bulk=2e7, shear=1e7, **angles, **law)
+
+    def full(y):
+        return share + (1 - share) * np.exp(-alpha * (y + (rain.TABLE - depth) * steep) * steep)
+
+    def alike(points, u):  # nothing changes along the slope
+        along = points.grad(u)[:, 0]
+        return 1e12 * ufl.inner(along, along) * points.dx
+
+    def pressure(y):
+        return WATER / alpha * np.log(full(y))
+
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [h, 0], [2 * h, height])],
+        [soil],
+        fluid=mpm.Fluid(gravity=9.81),
+        gravity=(9.81 * np.sin(rain.SLOPE), -9.81 * steep),
+        walls={"bottom": "xy"},
+        terms=[alike],
+        pressure=lambda x: pressure(x[:, 1]),
+        conditions=[mpm.Drained("bottom", float(pressure(0.0))), mpm.Rain("top", share * rain.K * steep)],
+    )
+    factor = mpm.factor_of_safety(s, dt=1e6, rtol=0.005, progress=False).factor
+    y = (np.arange(2000) + 0.5) / 2000 * height
+    weight = depth * 9.81 * (0.65 * 2650 + 350 * full(y)).mean()
+    held = rain.COHESION + (weight * steep**2 - full(0.0) * pressure(0.0)) * np.tan(rain.FRICTION)
+    assert factor == pytest.approx(held / (weight * np.sin(rain.SLOPE) * steep), rel=0.01)

@@ -121,6 +121,7 @@ def test_unsaturated_soil_consolidates_by_elements_as_its_linear_theory_says(ele
     assert -points.displacement[-1, 0, 1] == pytest.approx(settled, rel=2e-5)
 
 
+@pytest.mark.slow
 def test_a_front_runs_into_dry_soil_by_elements_as_by_material_points():
     """Of second order in h: place of -5 m after 12 h, water."""
     known, fronts, waters = Celia(), [], []

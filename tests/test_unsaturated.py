@@ -9,6 +9,7 @@ import pytest
 import ufl
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.solve.newton import Newton
 
 WATER = 9810.0  # N/m^3
 STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
@@ -64,13 +65,13 @@ def infiltrated(cells, dt):
 
 
 def test_rain_on_exponential_soil_is_that_of_srivastava_and_yeh():
-    """Of second order in h: 0.5 % of the largest head with 20 cells, 0.15 % with 40."""
+    """Within 0.6 % of the largest head with 20 cells, 0.15 % with 40: of second order in h."""
     coarse, fine = (infiltrated(cells, 600) for cells in (20, 40))
     for hour in (1, 6):
         size = np.abs(SRIVASTAVA_YEH[1]).max()
         assert np.abs(coarse[hour]).max() < 0.006 * size
         assert np.abs(fine[hour]).max() < 0.0015 * size
-        assert np.abs(fine[hour]).max() < 0.3 * np.abs(coarse[hour]).max()
+        assert np.log2(np.abs(coarse[hour]).max() / np.abs(fine[hour]).max()) > 1.8
 
 
 @pytest.mark.slow
@@ -89,7 +90,12 @@ def test_rain_on_exponential_soil_is_of_second_order_in_the_step():
 
 
 @pytest.mark.parametrize(
-    "cells, front, taken", [(25, 1.2e-3, 2.5e-3), pytest.param(50, 1e-3, 1e-3, marks=pytest.mark.slow)]
+    "cells, front, taken",
+    [
+        (25, 1.2e-3, 2.5e-3),
+        pytest.param(50, 1e-3, 1e-3, marks=pytest.mark.slow),
+        pytest.param(100, 2.5e-3, 1e-3, marks=pytest.mark.slow),
+    ],
 )
 def test_a_front_runs_into_dry_soil_as_that_of_celia(cells, front, taken):
     """Celia, Bouloutas and Zarba (1990), second case, after 12 h: place of -5 m (m), water (relative)."""
@@ -140,7 +146,7 @@ class Liakopoulos:
 
 
 def test_a_column_drains_and_settles_as_that_of_liakopoulos():
-    """20 cells: pressures within 0.5 % of the largest, settlement 0.2 %, outflow 2 %."""
+    """20 cells, up to 2 h: pressures within 0.5 % of the largest, settlement 0.2 %, outflow 2 %."""
     E, nu, h = 1.3e6, 0.4, 0.05
     law = {"conductivity": 4.5e-10 * WATER, "retention": Liakopoulos()}
     soil = mpm.LinearElastic(bulk=E / 3 / (1 - 2 * nu), shear=E / 2 / (1 + nu), porosity=0.2975, **law)
@@ -149,15 +155,17 @@ def test_a_column_drains_and_settles_as_that_of_liakopoulos():
     top, start = mpm.probes(s.bodies, [[h / 2, 1.0]]), water(s)
     known = {
         5: ((-233.53, -596.34, -1306.2, -2345.0, -3294.2), 0.54974e-3, 3.36719e-6),
+        10: ((-376.79, -949.79, -1982.1, -3283.3, -4335.7), 0.77114e-3, 2.72085e-6),
         30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
+        120: ((-906.99, -2267.84, -4542.4, -6847.5, -8264.9), 1.55827e-3, 3.33066e-7),
     }
     for minutes, (pressures, settled, flows) in known.items():
-        result = s.run(60 * minutes, 60 if minutes < 6 else 300, progress=False, probes=top)
+        result = s.run(60 * minutes, 6 * minutes, progress=False, probes=top)
         assert WATER * heads(s, [0.1, 0.25, 0.5, 0.75, 0.9]) == pytest.approx(pressures, abs=5e-3 * -pressures[-1])
         assert -result.displacement[-1, 0, 1] == pytest.approx(settled, rel=2e-3)
         assert s.outflows.array / h == pytest.approx([flows], rel=0.02)
-    # what has left is what the surface has sunk by, and the pores have lost
-    assert (start - water(s)) / h == pytest.approx(1.15932e-3 + 3.39008e-3, rel=5e-3)
+    # what has left is what the surface has sunk by, and the pores have lost; strains are finite: 0.16 %
+    assert (start - water(s)) / h == pytest.approx(1.55827e-3 + 7.10386e-3, rel=1e-2)
 
 
 class Pressed:
@@ -242,27 +250,28 @@ def test_hydrostatic_suction_is_at_rest():
     assert s.cells().stress[:, 1, 1].min() == pytest.approx(-9.81 * above, rel=1e-3)
 
 
-@pytest.mark.parametrize("off", [0.0, 0.3, 0.5])
-def test_seepage_through_layers_is_exact_at_any_offset(off):
-    """Steady, of exponential soils: below the border as it is, in the cell that holds both to first order."""
-    k, a, q, edge, cells = (1e-6, 1e-5), (2.0, 5.0), 0.5e-6, 0.5 + off / 20, 20
+def rising(head, k, a, q, z):
+    """Return heads at heights z, m, above one of this head in exponential soil, in steady rain of q, m/s."""
+    return np.log(q / k + (np.exp(a * head) - q / k) * np.exp(-a * z)) / a
+
+
+@pytest.mark.parametrize(("off", "k", "a"), [(0.0, 10, 2.5), (0.3, 10, 2.5), (0.5, 10, 2.5), (0.7, 100, 1)])
+def test_seepage_through_layers_is_exact_at_any_offset(off, k, a):
+    """Steady, of exponential soils; k, a: the upper one's over those of the lower one."""
+    k, a, q, edge = (1e-6, k * 1e-6), (2.0, 2.0 * a), 0.5e-6, 0.5 + off / 20
+    given = {"bulk": 1e13, "shear": 5e12, "porosity": 0.4}  # else a millimetre of settlement counts
     soils = [
-        mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=one, retention=mpm.Gardner(WATER / rate))
+        mpm.LinearElastic(**given, conductivity=one, retention=mpm.Gardner(WATER / rate))
         for one, rate in zip(k, a, strict=True)
     ]
+    water = {"fluid": mpm.Fluid(bulk=np.inf), "initial_stress": mpm.K0(0.5)}
     sides = [mpm.Drained("bottom"), mpm.Inflow("top", q)]
-    s = column(cells, soils, lambda x: -0.1 * WATER * x[:, 1], sides, edge=edge, initial_stress=mpm.K0(0.5))
-    s.run(1e7, 2e6, progress=False)
-
-    def rising(head, i, z):
-        return np.log(q / k[i] + (np.exp(a[i] * head) - q / k[i]) * np.exp(-a[i] * z)) / a[i]
-
+    s = column(20, soils, lambda x: -0.1 * WATER * x[:, 1], sides, edge=edge, **water)
+    s.run(1e9, 2.5e8, progress=False)
     z = s.cells().x[:, 1]
-    exact = np.where(z < edge, rising(0, 0, z), rising(rising(0, 0, edge), 1, z - edge))
-    error = np.abs(s.cells().pressure / WATER - exact)
-    assert error[z < edge - 0.05].max() < 4e-6
-    assert error[z > edge + 0.05].max() < 5e-4
-    assert error.max() < 5e-3
+    above = rising(rising(0, k[0], a[0], q, edge), k[1], a[1], q, z - edge)
+    exact = np.where(z < edge, rising(0, k[0], a[0], q, z), above)
+    assert s.cells().pressure / WATER == pytest.approx(exact, abs=1e-9)
 
 
 @dataclass(frozen=True)
@@ -397,6 +406,28 @@ def test_a_block_with_suction_falls_as_everything_does():
     assert water(s) == pytest.approx(start, rel=1e-9)
 
 
+@dataclass(frozen=True)
+class Unfelt(mpm.VanGenuchten):
+    """Suction that the skeleton does not feel."""
+
+    def bishop(self, p):
+        return 0 * p
+
+
+def test_water_in_two_soils_that_fall_does_not_flow():
+    soils = [
+        mpm.Hencky(1e7, 5e6, porosity=0.4, conductivity=k, retention=Unfelt(entry, n=2.0))
+        for k, entry in ((1e-3, 2e4), (1e-1, 4e4))
+    ]
+    grid = mpm.Grid([0, 0], [1, 2], [4, 8])
+    scene = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": {}, "pressure": -1e4, "inertia": True}
+    bodies = [mpm.box(grid, [0.2, a], [0.8, a + 0.5], material=i) for i, a in enumerate((0.81, 1.31))]
+    s = mpm.Simulation(grid, bodies, soils, **scene)
+    s.run(0.04, 0.02, progress=False)
+    assert s.points.displacement[:, 1] == pytest.approx(-9.81 * 0.04**2 / 2, rel=2e-4)
+    assert s.points.pressure == pytest.approx(-1e4, abs=10)
+
+
 def test_a_dry_column_swings_with_the_mass_of_its_water():
     """Its period is that of soil and of what pores hold, 8 % less than with full ones."""
     law, p = mpm.VanGenuchten(1e3, residual=0.3, n=4.0), -1e6
@@ -458,17 +489,35 @@ def test_a_water_table_rises_under_rain_as_that_of_vauclin(h):
 
 
 @pytest.mark.slow
-def test_very_dry_sand_beside_clay_is_ponded_and_stands_a_year():
-    """From -100 m of suction: an hour that may be cut, a day, and steps of a month."""
-    grid = mpm.Grid([0, 0], [1, 1.2], [10, 12])
+@pytest.mark.parametrize(
+    "cells, times", [(10, "hour day year"), (10, "hour whole"), (9, "hour whole"), (20, "hour whole")]
+)
+def test_very_dry_sand_beside_clay_is_ponded_and_stands_a_year(cells, times, monkeypatch):
+    """From -100 m of suction: an hour that may be cut, then a day, and steps of a month; or a year in one step."""
+    grid = mpm.Grid([0, 0], [1, 1 + 2 / cells], [cells, cells + 2])
     porous = {"bulk": 1e8, "shear": 5e7, "porosity": 0.4}
     sand = mpm.Hencky(**porous, conductivity=1e-4, retention=mpm.VanGenuchten(WATER / 14.5, residual=0.1, n=7.0))
     clay = mpm.Hencky(**porous, conductivity=1e-8, retention=mpm.VanGenuchten(WATER, residual=0.1, n=1.1))
     bodies = [mpm.box(grid, [0, 0], [0.5, 1]), mpm.box(grid, [0.5, 0], [1, 1], material=1)]
     scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "gravity": (0, -9.81)}
     scene |= {"conditions": [mpm.Drained("top", pressure=0.1 * WATER)], "pressure": -100 * WATER}
-    s = mpm.Simulation(grid, bodies, [sand, clay], initial_stress=mpm.K0(0.5), **scene)
-    for end, dt in ((3600.0, 3600.0), (86400.0, 21600.0), (365 * 86400.0, 30 * 86400.0)):
-        result = s.run(end, dt, progress=False)
-        assert result.newton <= 60 * (result.steps + result.cuts) and result.balance < 1e-8
+    s, counts = mpm.Simulation(grid, bodies, [sand, clay], initial_stress=mpm.K0(0.5), **scene), []
+    advanced, direction = mpm.Simulation.advanced, Newton._direction
+
+    def counted(self, dt):
+        counts.append(0)
+        return advanced(self, dt)
+
+    def one_more(*arguments):
+        counts[-1] += 1
+        return direction(*arguments)
+
+    monkeypatch.setattr(mpm.Simulation, "advanced", counted)
+    monkeypatch.setattr(Newton, "_direction", one_more)
+    day = 86400.0
+    runs = {"hour": (3600, 3600), "day": (day, day / 4), "year": (365 * day, 30 * day), "whole": (366 * day, 366 * day)}
+    for time in times.split():
+        result = s.run(*runs[time], progress=False)
+        assert result.balance < 1e-8
+    assert max(counts) <= 60
     assert s.cells().pressure.min() > 0

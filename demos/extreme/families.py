@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import pairwise
 from math import exp, inf, log, nan
 
 import numpy as np
@@ -356,31 +357,144 @@ def rain():
             yield f"k = {k:.0e} m/s, alpha h = {steep:.0e}", partial(rained, k, steep)
 
 
-def rained(k: float, steep: float, cells: int = 10) -> Scene:
-    """Return the column, and a time in which its heads become steady."""
-    h, weight = 1 / cells, 9810.0
-    alpha = steep / h
-    grid = mpm.Grid([0, 0], [h, 1 + 2 * h], [1, cells + 2])
+def rained(k: float, steep: float) -> Scene:
+    """Return the column in rain of k / 2, and a time in which its heads become steady."""
 
-    def steady(share: float, z: np.ndarray) -> np.ndarray:
-        """Return heads, m, in rain of a share of k."""
+    def steady(share: float, alpha: float, z: np.ndarray) -> np.ndarray:
         return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
 
-    law = {"porosity": 0.4, "conductivity": k, "retention": mpm.Gardner(weight / alpha)}
-    column = mpm.Simulation(
+    def exact(z: np.ndarray) -> np.ndarray:
+        return steady(0.5, 10 * steep, z)
+
+    def start(z: np.ndarray) -> np.ndarray:
+        return steady(0.05, 10 * steep, z)
+
+    return exponential([k], [10 * steep], [mpm.Rain("top", k / 2)], exact, start, 100 / k)
+
+
+@family(1e-4)
+def evaporation():
+    """Column above a water table in air of -1.5 m, k = 1e-12 ... 1 m/s, alpha h = 1e-3 ... 1e2: heads, exact."""
+    for k in decades(-12, 0, 4):
+        for steep in decades(-3, 2):
+            yield f"k = {k:.0e} m/s, alpha h = {steep:.0e}", partial(dried, k, steep)
+
+
+def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
+    """Return the column from water at rest on, with more sun than it has water for."""
+    alpha = 10 * steep
+
+    def exact(z: np.ndarray) -> np.ndarray:
+        lost = (np.exp(alpha * (z - 1)) - np.exp(-alpha)) / -np.expm1(-alpha)
+        return np.log1p(lost * np.expm1(alpha * (driest + 1))) / alpha - z
+
+    sun = mpm.Rain("top", -1e3 * k, driest=driest * 9810.0)
+    return exponential([k], [alpha], [sun], exact, np.negative, 100 / k)
+
+
+@family(1e-4)
+def layered_rain():
+    """Two layers, off the grid lines, in rain, k differs by 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: heads, exact; also in
+    axisymmetry and 3D."""
+    for ratio in decades(-3, 3, 2):
+        for steep in decades(-2, 2):
+            for other in (0.1, 10.0):
+                given = partial(rained_layers, ratio, steep, other)
+                yield f"k ratio {ratio:.0e}, alpha h = {steep:.0e}, {steep * other:.0e}", given
+    for grid in ("axisymmetric", "3D"):
+        yield grid, partial(rained_layers, 10.0, 0.3, 3.0, grid)
+
+
+def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
+    """Return a column of two layers; ratio, other: conductivity and steepness of the upper over the lower one's."""
+    k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
+    rain = min(k) / 2
+
+    def exact(z: np.ndarray, q: float = rain) -> np.ndarray:
+        def above(head: float, i: int, way: np.ndarray) -> np.ndarray:
+            return np.log(q / k[i] + (np.exp(alpha[i] * head) - q / k[i]) * np.exp(-alpha[i] * way)) / alpha[i]
+
+        return np.where(z < edge, above(0.0, 0, z), above(above(0.0, 0, edge), 1, np.maximum(z - edge, 0.0)))
+
+    def start(z: np.ndarray) -> np.ndarray:
+        return exact(z, rain / 5)
+
+    return exponential(k, alpha, [mpm.Rain("top", rain)], exact, start, 1e3 / rain, edge, grid)
+
+
+def exponential(
+    k: list[float],
+    alpha: list[float],
+    sides: list,
+    exact: Callable[[np.ndarray], np.ndarray],
+    start: Callable[[np.ndarray], np.ndarray],
+    end: float,
+    edge: float | None = None,
+    kind: str = "plane",
+) -> Scene:
+    """Return a column of 1 m and ten cells over a water table, of one or two exponential soils; its heads are exact.
+
+    k, alpha: conductivities, m/s, and how steeply they fall with the head, 1/m; exact, start: heads, m, by heights, m;
+    edge: from where the second soil lies, m; kind: of the grid.
+    """
+    h, weight, d = 0.1, 9810.0, 3 if kind == "3D" else 2
+    grid = mpm.Grid([0] * d, [h] * (d - 1) + [1 + 2 * h], [1] * (d - 1) + [12], axisymmetric=kind == "axisymmetric")
+    soils = [
+        mpm.LinearElastic(1e9, 5e8, porosity=0.4, conductivity=one, retention=mpm.Gardner(weight / a))
+        for one, a in zip(k, alpha, strict=True)
+    ]
+    ends = [0.0, 1.0] if edge is None else [0.0, edge, 1.0]
+    flat = [0.0] * (d - 1)
+    bodies = [mpm.box(grid, [*flat, a], [*[h] * (d - 1), b], material=i) for i, (a, b) in enumerate(pairwise(ends))]
+    walls = {"left": "x", "right": "x", "bottom": "xyz"[d - 1]} | ({"front": "y", "back": "y"} if d == 3 else {})
+    if kind == "axisymmetric":
+        del walls["left"]
+    simulation = mpm.Simulation(
         grid,
-        [mpm.box(grid, [0, 0], [h, 1])],
-        [mpm.LinearElastic(bulk=1e9, shear=5e8, **law)],
+        bodies,
+        soils,
         fluid=mpm.Fluid(),
-        gravity=(0, -9.81),
-        walls={"left": "x", "right": "x", "bottom": "y"},
-        conditions=[mpm.Drained("bottom"), mpm.Rain("top", k / 2, name="rain")],
-        pressure=lambda x: weight * steady(0.05, x[:, 1]),
+        gravity=(*flat, -9.81),
+        walls=walls,
+        conditions=[mpm.Drained("bottom"), *sides],
+        pressure=lambda x: weight * start(x[:, -1]),
         initial_stress=mpm.K0(0.5),
     )
 
     def error(s: mpm.Simulation, result: mpm.Result) -> float:
         cell = s.cells()
-        return off(cell.pressure / weight, steady(0.5, cell.x[:, 1]))
+        return off(cell.pressure / weight, exact(cell.x[:, -1]))
 
-    return Scene(column, 100 / k, 20, error)
+    return Scene(simulation, end, 20, error)
+
+
+@family(1e-3)
+def ponding():
+    """Column of van Genuchten's soil, n = 1.2 ... 7, that is ponded at heads of -1 ... -100 m: steady heads, exact."""
+    for n in (1.2, 2.0, 7.0):
+        for head in (-1.0, -10.0, -100.0):
+            for alpha in (0.5, 15.0):
+                yield f"n = {n:g}, alpha = {alpha:g} /m, head {head:g} m", partial(ponded, n, head, alpha)
+
+
+def ponded(n: float, head: float, alpha: float) -> Scene:
+    """Return a column whose pores all fill, and drain at its base."""
+    law = mpm.VanGenuchten(9810.0 / alpha, residual=0.1, n=n, air_entry=100.0)
+    soil = mpm.LinearElastic(1e9, 5e8, porosity=0.4, conductivity=1e-5, retention=law)
+    grid = mpm.Grid([0, 0], [0.1, 1.2], [1, 12])
+
+    def error(s: mpm.Simulation, result: mpm.Result) -> float:
+        return off(s.cells().pressure / 9810.0, 0.1 * s.cells().x[:, 1], 1)
+
+    simulation = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [0.1, 1])],
+        [soil],
+        fluid=mpm.Fluid(),
+        gravity=(0, -9.81),
+        walls={"left": "x", "right": "x", "bottom": "y"},
+        conditions=[mpm.Drained("bottom"), mpm.Drained("top", pressure=981.0)],
+        pressure=9810.0 * head,
+        initial_stress=mpm.K0(0.5),
+    )
+    return Scene(simulation, 1e7, 20, error)

@@ -71,6 +71,14 @@ def density_between(p0, p1, compliance):
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 
+def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
+    """Return the same at pressures (n,), Pa, of arrays; bulk: K_w, Pa."""
+    z = (p0 - p1) / (2 * bulk)
+    small = np.abs(z) < SERIES
+    away = np.where(small, 1.0, z)
+    return np.exp((p0 + p1) / (2 * bulk)) * np.where(small, 1 + z**2 / 6, np.sinh(away) / away)
+
+
 def _sinhc(z):
     small = ufl.lt(abs(z), SERIES)
     away = ufl.conditional(small, 1.0, z)  # UFL evaluates and differentiates both branches

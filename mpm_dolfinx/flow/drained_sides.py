@@ -168,12 +168,14 @@ class OpenFaces:
 class UnsaturatedFaces(OpenFaces):
     """The same of soil whose pores drain; conductance: over the mobility.
 
-    relative: mobilities by pressures; cells (m,): behind the faces; outer (m,): potentials beyond, less the weight of
-    the fluid on the way, Pa; beyond (m,): pressures there, Pa; fall (m,): the weight on the way, Pa.
+    relative: mobilities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): potentials
+    beyond, less the weight of the fluid on the way, Pa; beyond (m,): pressures there, Pa; fall (m,): the weight on the
+    way, Pa.
     """
 
     relative: Relative
     cells: NDArray[np.int32]
+    normal: NDArray[np.float64]
     outer: NDArray[np.float64]
     beyond: NDArray[np.float64]
     fall: NDArray[np.float64]
@@ -195,12 +197,15 @@ class UnsaturatedFaces(OpenFaces):
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
-        return self.conductance * self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond, self.fall)[0]
+        return self.conductance * self._through(fluid)[0]
 
     def rises(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return by how much more leaves as the cell's pressure rises, never less."""
-        k, slope = self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond, self.fall)
-        return self.conductance * np.maximum(k + slope * (fluid.pi[self.at] - self.outer), 0.0)
+        return self.conductance * self._through(fluid)[1]
+
+    def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return k_r of the faces (m,) at the cells' pressures, and the slopes of what it lets through."""
+        return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.beyond, self.fall)
 
 
 @dataclass(frozen=True)
@@ -308,7 +313,7 @@ class SideFeeds(Feeds):
         if flow.relative is None:
             return OpenFaces(at, conductance, inflow, self._seeps, reach)
         fall = np.zeros(len(at)) if flow.weight is None else reach @ flow.weight
-        where = flow.relative, sides.cells, sides.outer(at, flow), sides.pressure, fall
+        where = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, fall
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, reach, *where)
 
     def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:

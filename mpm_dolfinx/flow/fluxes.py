@@ -38,14 +38,17 @@ class Mobility:
 
     mean (n,): of the pieces, m^2/(Pa s); share (n, d): of it along each axis; shift (n, d): way, m, from the centroid
     to the place from which the resistance to the faces counts.  The last two are None where no cell holds several
-    conductivities.  Where pores drain, shares (n, k): what soils with full pores, and each law of retention, bring to
-    the mean at k_r = 1; the mean is then one.
+    conductivities.  Where pores drain, mean and share are those of full pores; shares (n, k): of soils whose pores stay
+    full and of each law of retention in the mean; ways: of the cells that hold several soils, see `series`; borders:
+    faces between cells that do not conduct alike.
     """
 
     mean: NDArray[np.float64]
     share: NDArray[np.float64] | None = None
     shift: NDArray[np.float64] | None = None
     shares: NDArray[np.float64] | None = None
+    ways: Any = None
+    borders: Any = None
 
 
 class CellMotion(NamedTuple):
@@ -474,4 +477,6 @@ class FluxForms:
         for f, rows in values.items():
             f.x.array.reshape(-1, d)[filled] = rows
             f.x.scatter_forward()
+        if self.relative is not None:
+            self.relative.set_borders(contents, flow, *(f.x.array.reshape(-1, d) for f in (self.centroid, self.moved)))
         return mobility

@@ -22,9 +22,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.fluxes import CellContents, Mobility
+from mpm_dolfinx.flow.series import Ways, none
 from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
@@ -69,15 +70,21 @@ class MixedCells:
         Their volumes (m,), m^d.
     contents
         What the cells hold.
+    alike
+        What those pieces (m, k) have in common that conduct alike.
     """
 
-    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents):
+    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, alike):
         self._rows = rows
         self._x = x
+        self._kind = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
         self._volume = volume
         own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
         self._h = contents.grid.sizes(own)
-        self._filled, middle = contents.slot(own), contents.centroid[own] / self._h
+        self.cells = own
+        """The cells."""
+        self._filled, self._middle = contents.slot(own), contents.centroid[own] / self._h
+        middle = self._middle
         self._room = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
         count, first = count[self._at], first[self._at]
         ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
@@ -107,25 +114,35 @@ class MixedCells:
         return out
 
     def mobility(
-        self, kappa: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
+        self,
+        kappa: NDArray[np.float64],
+        mean: NDArray[np.float64],
+        share: NDArray[np.float64] | None,
+        now: NDArray[np.float64] | None = None,
     ) -> Mobility:
         """Return the mobility of all filled cells, of their means (n,) and of those of all pieces, m^2/(Pa s).
 
-        share (n, d): along the axes in the other cells, which is changed here.
+        share (n, d): along the axes in the other cells, which is changed here; now: of all pieces at their pressures,
+        where pores drain.  The place is then the centroid, where layers do not lie aslant.
         """
         along, off = self._along(kappa[self._rows])
+        if now is not None:
+            off = self._along(now[self._rows], 0.0)[1]
         shift = np.zeros((len(mean), along.shape[1]))
         share = np.ones_like(shift) if share is None else share
         share[self._filled] = np.divide(along, mean[self._filled, None], out=np.zeros_like(along), where=along > 0)
         shift[self._filled] = off.clip(*self._room) * self._h
         return Mobility(mean, share, shift)
 
-    def _along(self, kappa: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes and shifts, cells, of mixed cells (n, d), of those of their pieces."""
+    def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mobilities along the axes and shifts, cells, of mixed cells (n, d), of those of their pieces.
+
+        mean: 0 where shifts are from the middle, not from the place of mean pressure.
+        """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
         shift = np.zeros((n, d))
-        sharper = self._sharper(kappa)
+        sharper = self._sharper(kappa) + mean
         with np.errstate(divide="ignore"):
             resistivity = 1 / kappa
         for axis, lines in enumerate(self._lines):
@@ -141,8 +158,67 @@ class MixedCells:
             np.divide(sum_by(self._at, conducts * off, n), total, out=shift[:, axis], where=total > 0)
         return mobility, shift
 
+    def ways(
+        self, kappa: NDArray[np.float64], law: NDArray[np.int64], laws: int, shift: NDArray[np.float64] | None
+    ) -> Ways:
+        """Return the ways (n, d, 2, ...) to the ends of what the mixed cells hold.
+
+        Parameters
+        ----------
+        kappa, law
+            Of all pieces (m,): mobilities, m^2/(Pa s), with full pores, and numbers of their laws, below `laws`.
+        shift
+            Of the filled cells (n, d): from their centroids to where their pressures are, m; None: nothing.
+        """
+        kappa, law = kappa[self._rows], law[self._rows]
+        place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
+        found = [self._way(axis, end, kappa, law, laws, place[:, axis]) for axis, end in np.ndindex(place.shape[1], 2)]
+        slots = max(1, *(way.law.shape[1] for way in found))
+        grown, shape = [way.with_slots(slots) for way in found], (*place.shape, 2)
+        return Ways(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in zip(*grown, strict=True)))
+
+    def _way(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Ways:
+        """Return the ways (n, ...) from places (n,) along an axis, in the cell, to one of its ends."""
+        n, sign, lines = len(place), 2 * end - 1, self._lines[axis]
+        middle = sign * (self._x[lines.piece, axis] - place[self._at[lines.line]])
+        length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part beyond the place
+        kept = np.flatnonzero(length > SAME)
+        kept = kept[np.lexsort((middle[kept], lines.line[kept]))]
+        line, piece, length = lines.line[kept], lines.piece[kept], length[kept]
+        total = sum_by(line, length, len(kappa))
+        weight = np.where(total > 0, self._volume, 0.0)
+        weight = weight / np.maximum(sum_by(self._at, weight, n), TINY)[self._at]
+        part = length / total[line]
+        with np.errstate(divide="ignore"):
+            resists = part / kappa[piece]
+        run = np.append(0, np.cumsum((np.diff(line) != 0) | (np.diff(self._kind[piece]) != 0)))
+        start = np.searchsorted(line, line)
+        run = run - run[start] if len(run) and len(line) else run[:0]
+        several = np.zeros(len(kappa), dtype=bool)
+        several[line[run > 0]] = True
+        alone = ~several[line]
+        beside = np.zeros((n, laws))
+        first = np.zeros(len(kappa), dtype=np.int64)
+        first[line] = law[piece]
+        resistance = sum_by(line[alone], resists[alone], len(kappa))
+        lone = np.flatnonzero((total > 0) & ~several)
+        np.add.at(beside, (self._at[lone], first[lone]), weight[lone] / resistance[lone])
+        cell = self._at[line]
+        share = sum_by(self._at, np.where(several, weight, 0.0), n)
+        keys = np.stack([cell, run, self._kind[piece]], axis=1)[~alone]
+        slots, slot = np.unique(keys, axis=0, return_inverse=True)
+        slot = slot.ravel()
+        of = slots[:, 0]
+        number = np.arange(len(of)) - np.searchsorted(of, of)
+        out = none(n, laws, int(number.max(initial=-1)) + 1)
+        counts = weight[line[~alone]]
+        out.law[of[slot], number[slot]] = law[piece[~alone]]
+        np.add.at(out.length, (of[slot], number[slot]), counts * part[~alone] / share[of[slot]])
+        np.add.at(out.resistance, (of[slot], number[slot]), counts * resists[~alone] / share[of[slot]] ** 2)
+        return out._replace(beside=beside)
+
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how much further (n,) than of mean pressure the place of a cell's pressure is from the middle."""
+        """Return how much further (n,) than of mean pressure a cell's place lies, where layers are aslant."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,7 +231,7 @@ class MixedCells:
         moment = np.stack([total(conducts * x) for x in self._x.T], axis=1) ** 2
         whole = moment.sum(axis=1) ** 2
         aslant = np.divide(whole - (moment**2).sum(axis=1), 2 * whole, out=np.zeros(n), where=whole > 0)
-        return 1 + aslant / ASLANT**2
+        return aslant / ASLANT**2
 
 
 def graded(
@@ -212,4 +288,4 @@ def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellConte
     else:
         half = 0.5 * (volume / grid.volumes(cells))[:, None] ** (1 / grid.dim)
         low, high = x - half, x + half
-    return MixedCells(rows, cells, low, high, x, volume, contents)
+    return MixedCells(rows, cells, low, high, x, volume, contents, alike[rows])

@@ -195,6 +195,8 @@ class StorageForms:
             self.fluxes.relative.set_pressures(self.p.x.array)
         self._work.x.array[active] = 0.0
         assembled.assemble_vector(self._work.x.array)
+        if self.fluxes.relative is not None and self.fluxes.relative.borders is not None:
+            self.fluxes.relative.borders.add_fluxes(self._work.x.array)
         return sum_ghosts(self._work)
 
 
@@ -268,6 +270,7 @@ class StorageSystem:
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
         self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
+        self._facets = facets
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
         pattern = self.L
@@ -307,10 +310,15 @@ class StorageSystem:
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
         """Assemble the fluxes through inner faces; off: of `AslantFlow`, where there is any."""
-        mobility = self._forms.fluxes.set_conduction(contents, flow)
+        fluxes = self._forms.fluxes
+        mobility = fluxes.set_conduction(contents, flow)
+        if fluxes.relative is not None:
+            borders = flow.mobility.borders
+            alike = self._facets if borders is None else borders.alike
+            self._flux, self.gravity = fluxes.flux.on(alike), fluxes.gravity.on(alike)
         if (relative := self._forms.fluxes.relative) is not None:
             p = self._forms.p.x.array[contents.filled]
-            mobility = mobility * relative.through_sides(contents.filled, p, p)[0][:, None]
+            mobility = mobility * relative.at(contents.filled, p)[:, None]
             flow = replace(flow, relative=relative)
         self.assemble_fluxes()
         total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # also of a cell without faces
@@ -327,6 +335,8 @@ class StorageSystem:
             relative.set_pressures(self._forms.p.x.array)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
+        if relative is not None and relative.borders is not None:
+            relative.borders.add_slopes(self.T, self.unknowns)
         self.T.assemble()
 
 
@@ -514,9 +524,7 @@ class StorageProblem:
         return SAME if self.forms.retains else 1.0
 
     def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,)."""
-        if self._scale is None:
-            return dp
+        """Return by how much pressures are to fall, Pa, where pores drain and Newton's method asks for falls (n,)."""
         return restrained(self.forms.p.x.array[self.system.unknowns.owned], dp, self._scale)
 
     def settle(self) -> bool:
@@ -584,15 +592,17 @@ class StorageProblem:
 
     def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
-        system, fluid = self.system, self._fluid
+        system, fluid, relative = self.system, self._fluid, self.forms.fluxes.relative
+        if self._inertial is not None:
+            fluid = fluid._replace(force=self._inertial())
+            if relative is not None and relative.borders is not None:
+                relative.borders.set_force(system.unknowns.owned, fluid.force)
         if system.gravity is None:
             cells = system.between(fluid.pi) + self._aslant
         else:
             cells = self.forms.driven(system.gravity, self._contents.active)[system.unknowns.owned] + self._aslant
         lost, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
-        if self._inertial is not None:
-            fluid = fluid._replace(force=self._inertial())
         for one, at in zip(self._feeds, outflow.at, strict=True):
             leaving = one.leaving(at, fluid)
             lost, gain = lost + leaving.cells, gain + leaving.gain

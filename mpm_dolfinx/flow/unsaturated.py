@@ -4,7 +4,7 @@
 Through a face soil conducts as on the mean over the pressures between the two sides (`retention.Conductance`): neither
 that of the wetter side, which would let a front run ahead, nor the mean of both.  Where the fluid's weight drives as
 well, that mean is `fitted`: steady flow through exponential soil is met exactly.  A cell that holds several soils
-conducts by the sum of their shares.  In series their resistances are those at the start of a substep.
+conducts as `series` has it.
 """
 
 from __future__ import annotations
@@ -94,6 +94,28 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
     return of.where(small, z * z / 24, value), of.where(small, z / 12, (1 / of.tanh(half) - 1 / half) / 2)
 
 
+class Laws:
+    """The laws of the conductivity by the pressure, by their numbers; 0: of pores that stay full."""
+
+    def __init__(self, grid: Grid, laws: Sequence):
+        self.conductances = [Conductance(grid, law) for law in laws]
+        self.scales = np.array([1 / TINY, *(law.scale for law in self.conductances)])
+        """Suctions about which they fall, Pa."""
+
+    def between(
+        self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], fall: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return k_r (m,) of laws (m,) between pressures on both sides (m,), Pa, and slopes (2, m): see `fitted`."""
+        k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
+        for number, one in enumerate(self.conductances, 1):
+            rows = np.flatnonzero(law == number)
+            if len(rows):
+                ends = [side[rows] for side in p]
+                found = fitted(ends, [one(side).T for side in ends], fall[rows], one.scale, NUMPY)
+                k[rows], slopes[:, rows] = found.k, found.slopes
+        return k, slopes
+
+
 class Relative:
     """Conductivities of cells by their pressures.
 
@@ -107,20 +129,24 @@ class Relative:
     Attributes
     ----------
     shares
-        DG0: mobilities, m^2/(Pa s), that soils with full pores bring to a cell, and each of the laws, at k_r = 1.
+        DG0: shares of soils whose pores stay full, and of each of the laws, in a cell's mobility at k_r = 1.
+    borders
+        Faces between cells that do not conduct alike, as these conduct; None where all do.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
-        self._laws = [Conductance(grid, law) for law in retentions.laws]
-        self.count = 1 + len(self._laws)
+        self._laws = Laws(grid, retentions.laws)
+        self.count = len(self._laws.scales)
         self.shares = fem.Function(grid.cellwise((self.count,)))
-        self._tables = fem.Function(grid.cellwise((3 * len(self._laws),)))
+        self._tables = fem.Function(grid.cellwise((3 * (self.count - 1),)))
         self._mesh = grid.mesh
+        self.borders = None
+        self._of_sides = None
 
     def between(self, pressure: fem.Function, fall) -> list[Between]:
         """Return k_r of each law between the two sides of a face as UFL variables: see `fitted`."""
         out = []
-        for i, law in enumerate(self._laws):
+        for i, law in enumerate(self._laws.conductances):
             tables = [[self._tables(side)[3 * i + j] for j in range(3)] for side in "+-"]
             scale = fem.Constant(self._mesh, law.scale)
             found = fitted([pressure(side) for side in "+-"], tables, fall, scale, UFL)
@@ -128,34 +154,53 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return the mobility of the cell on a side of a face, as UFL of k_r of each law there."""
+        """Return by how much less the cell on a side of a face conducts, as UFL of k_r of each law there."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64]) -> None:
         """Set what forms see of the pressures of the local cells (c,), Pa."""
-        self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws], axis=1).ravel()
+        self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
+        if self.borders is not None:
+            self.borders.set_pressures(p)
+
+    def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return k_r (m,) of owned cells at pressures (m,), Pa."""
+        k = np.stack([np.ones(len(p)), *(law(p)[:, 1] for law in self._laws.conductances)], axis=1)
+        return (self.shares.x.array.reshape(-1, self.count)[cells] * k).sum(axis=1)
 
     def through_sides(
         self,
         cells: NDArray[np.int32],
+        normal: NDArray[np.float64],
         p: NDArray[np.float64],
         outer: NDArray[np.float64],
-        fall: NDArray[np.float64] | float = 0.0,
+        fall: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes by theirs.
+        """Return k_r (m,) of owned cells along normals (m, d) between their pressures and others (m,), Pa.
 
-        fall (m,), Pa: what the fluid's weight drives by out of the cells.
+        Also by how much k_r times what drives rises with their pressures.  fall (m,), Pa: what the fluid's weight
+        drives by out of the cells.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, slope = shares[:, 0].copy(), np.zeros(len(p))
-        for law, share in zip(self._laws, shares.T[1:], strict=True):
+        k, rises, drives = shares[:, 0].copy(), shares[:, 0].copy(), p - outer + fall
+        for law, share in zip(self._laws.conductances, shares.T[1:], strict=True):
             between = fitted((p, outer), (law(p).T, law(outer).T), fall, law.scale, NUMPY)
             k += share * between.k
-            slope += share * between.slopes[0]
-        return k, slope
+            rises += share * (between.k + between.slopes[0] * drives)
+        if self._of_sides is not None:
+            borders, mobility = self._of_sides
+            for rows, *found in borders.through_sides(self._laws, mobility, cells, normal, p, outer, fall):
+                k[rows], rises[rows] = found
+        return k, np.maximum(rises, 0.0)
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
         """Set the shares (n, count) of the filled owned cells."""
         self.shares.x.array[:] = 0.0
         self.shares.x.array.reshape(-1, self.count)[filled] = shares
         self.shares.x.scatter_forward()
+
+    def set_borders(self, contents, flow, places: NDArray[np.float64], moved: NDArray[np.float64]) -> None:
+        """Set the faces between cells that do not conduct alike, by how the cells conduct: see `borders`."""
+        borders = flow.mobility.borders
+        self.borders = borders and borders.faces(self._laws, contents, flow, places, moved)
+        self._of_sides = borders and (borders, flow.mobility)

@@ -303,6 +303,8 @@ class LinearSolvers:
 
     def restrain(self, storage: StorageProblem) -> None:
         """Limit the fall of pressures along the direction as the storage requires, and adapt the displacements."""
+        if not storage.forms.retains:
+            return
         dp = storage.restrained(self.dp.array_r)
         far = not np.array_equal(dp, self.dp.array_r)
         if not self.du.comm.tompi4py().allreduce(far, MPI.LOR):

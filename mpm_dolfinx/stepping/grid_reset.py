@@ -23,6 +23,7 @@ from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
+from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
@@ -101,7 +102,7 @@ class OnGrid(Keyed):
         self.stiffness = np.zeros(grid.num_local)
         """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
         np.maximum.at(self.stiffness, cut.cells, rows)
-        self.contents, self._mixed = None, None
+        self.contents, self._mixed, self._borders = None, None, None
         if storage is not None:
             brought = PieceContents(
                 cells=cut.cells,
@@ -118,7 +119,11 @@ class OnGrid(Keyed):
                 self._places = replace(self._places, lever=lever)
                 self.data = quadrature.data(cut, self._places, points)
             if quadrature.layered:
-                self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
+                alike = quadrature.conducting(cut)
+                self._mixed = mixed_cells(cut, alike, self.contents)
+                if storage.fluxes.relative is not None:
+                    law = cut.to_cells(quadrature.materials.retention_of(cut.points))
+                    self._borders = Borders(self.contents, cut.cells, alike, law, self.facets, self._mixed)
 
     @property
     def mixes(self) -> bool:
@@ -338,34 +343,30 @@ class OnGrid(Keyed):
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: raise an error for invalid values."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
-        if self._storage.fluxes.relative is not None:
-            return self._relative_mobility(at_pieces)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
+        if self._storage.fluxes.relative is not None:
+            return self._relative_mobility(at_pieces, mean, share)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
 
-    def _relative_mobility(self, full: NDArray[np.float64]) -> Mobility:
-        """Return the mobility of cells in unsaturated soil, from saturated values at their pieces (m,), m^2/(Pa s).
-
-        Several soils in a cell have their ratio at the present pressure.
-        """
+    def _relative_mobility(
+        self, full: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
+    ) -> Mobility:
+        """Return the mobility of cells in unsaturated soil, from saturated values at their pieces (m,), m^2/(Pa s)."""
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
         shares = np.stack([self.contents.mean(full * (law == i)) for i in range(count)], axis=1)
-        one = np.ones(len(shares))
-        if self._mixed is None and self._storage.conductivity is None:
-            return Mobility(one, shares=shares)
+        shares = np.divide(shares, mean[:, None], out=np.zeros_like(shares), where=mean[:, None] > 0)
+        given = {"shares": shares, "borders": self._borders}
+        if self._mixed is None:
+            return Mobility(mean, share, **given)
         k = self._quadrature.materials.saturation(
             cut.points, cut.to_pieces(self._storage.p_before.x.array[cut.cells]), cut.pieces.point
         )[3]
-        now = full * np.maximum(cut.pieces_to_cells(k), TINY)
-        mean, share = self.contents.mean(now), None
-        if self._storage.conductivity is not None:
-            share = graded(self.contents, self._places.pieces.offset, now, mean)
-        mobility = Mobility(mean, share) if self._mixed is None else self._mixed.mobility(now, mean, share)
-        return replace(mobility, mean=one, shares=shares)
+        mobility = self._mixed.mobility(full, mean, share, full * np.maximum(cut.pieces_to_cells(k), TINY))
+        return replace(mobility, ways=self._mixed.ways(full, law, count, mobility.shift), **given)
 
     def pore_water(self, points: MaterialPoints) -> PoreWater | None:
         """Return the water in the pieces with the porosities of the points, in unsaturated soil; arrays by cells."""

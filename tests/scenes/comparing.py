@@ -38,7 +38,7 @@ def differences(scene: Scene, one: Sequence[Shown], other: Sequence[Shown]) -> d
     return out
 
 
-OF_POINTS = ("displacement", "stress", "volume", "pressure")
+OF_POINTS = ("displacement", "stress", "volume", "pressure", "saturation")
 
 
 def softest(scene: Scene) -> float:
@@ -66,6 +66,8 @@ def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
     for name in ("reactions", "tools"):
         found[name] = max(found[name], 1e-3 * stress * h ** (d - 1))
     found["outflows"] = max(found["outflows"], 1e-3 * (moved / scene.end + _seeps(scene)) * h ** (d - 1))
+    if "rain" in found:
+        found["rain"] = max(found["rain"], found["outflows"] * scene.end)
     found["travel"] = max(found["travel"], LEAST * h)
     return found
 

@@ -41,9 +41,9 @@ class Block:
 class Condition:
     """A condition on a side.
 
-    kind: "traction", "normal", "pressure", "displacement", "plate", "drained", "seepage", "inflow", "springs";
-    value: along the axes, or one number; it grows until the time `ramp`, s, if that is not 0; components: that are
-    given; region: box of reference positions, m.
+    kind: "traction", "normal", "pressure", "displacement", "plate", "drained", "seepage", "inflow", "rain", "springs";
+    value: along the axes, or one number, of rain its flux, m/s, and pressures of its pond and of air, Pa; it grows
+    until the time `ramp`, s, if that is not 0; components: that are given; region: box of reference positions, m.
     """
 
     kind: str
@@ -152,6 +152,7 @@ class Scene:
             ),
             f"contact {self.contact:.1g}" if self.contact is not None else "",
             f"initial {self.initial}" if self.initial else "",
+            "+".join(law["retention"][0] for _, law in self.materials if law.get("retention")),
             "source" if self.rate else "",
             "springs" if self.stiffness else "",
             self.method if self.method != "sdirk2" else "",
@@ -281,6 +282,36 @@ def drawn(seed: int, **given) -> Scene:
         stiffness=draw.order(3, 5) if contact is None and draw.yes(0.15) else 0.0,
     )
     return scene.with_(stage=_stage(draw, scene))
+
+
+def draining(seed: int, **given) -> Scene:
+    """Return the scene of a seed whose pores drain: with retention, a water table, rain or evaporation; as `drawn`."""
+    scene, draw = drawn(seed, wet=True, **given), Draw([seed, 4])
+    kinds = [_retention(draw) for _ in range(draw.whole(1, 2))]
+    of = [draw.one(*kinds) if draw.yes(0.85) else None for _ in scene.materials]
+    of[0] = of[0] or kinds[0]
+    materials = tuple((law, c | {"retention": kind}) for (law, c), kind in zip(scene.materials, of, strict=True))
+    top = scene.bodies[-1].upper[-1]
+    scene = scene.with_(materials=materials, level=top * draw.between(-0.5, 0.9))
+    if draw.yes(0.3):
+        return scene
+    rain = draw.one(-1.0, 1.0, weights=[1, 2]) * draw.order(-8, -4), draw.one(0.0, 200.0), -draw.order(4, 6)
+    kept = [c for c in scene.conditions if c.side != "top" or c.kind not in ("drained", "seepage", "inflow")]
+    region = _above(scene) if scene.contact is not None else None
+    return scene.with_(
+        conditions=(*kept, Condition("rain", "top", rain, scene.end * draw.one(0.0, 0.6), region=region))
+    )
+
+
+def _retention(draw: Draw) -> tuple[str, dict[str, float]]:
+    """Return a law of retention and its constants."""
+    name = draw.one("VanGenuchten", "Gardner", "BrooksCorey")
+    constants = {"entry": draw.order(3.0, 4.5), "residual": draw.one(0.0, 0.1)}
+    if name == "VanGenuchten":
+        constants |= {"n": draw.between(1.3, 4.0), "air_entry": 0.02 * constants["entry"]}
+    if name == "BrooksCorey":
+        constants["index"] = draw.between(0.5, 4.0)
+    return name, constants
 
 
 def _ground(draw: Draw, size, h, dim: int, axisymmetric: bool):

@@ -167,6 +167,11 @@ class _Builder:
         if "viscosity" in given:
             given["viscosity"] *= frame.stress * frame.time
         given["grain_density"] = given.get("grain_density", 2650.0) * frame.density
+        if kind := given.get("retention"):
+            name, numbers = kind
+            given["retention"] = getattr(mpm, name)(
+                **numbers | {k: frame.stress * numbers[k] for k in ("entry", "air_entry") if k in numbers}
+            )
         if given.get("conductivity"):  # such that k / gamma_w is a length^2 over stress and time
             mobility = given["conductivity"] / (WATER * G) * frame.length**2 / frame.stress / frame.time
             given["conductivity"] = mobility * self.water(np.inf).unit_weight
@@ -188,6 +193,7 @@ class _Builder:
             "drained": "drained",
             "seepage": "drained",
             "inflow": "inflows",
+            "rain": "inflows",
             "springs": "terms",
         }
         for condition in self.scene.conditions:
@@ -245,6 +251,10 @@ class _Builder:
             return mpm.RigidPlate(side, self.grown(frame.force(scene) * c.value[0], c.ramp), region=region)
         if c.kind == "inflow":
             return mpm.Inflow(side, self.grown(frame.length / frame.time * c.value[0], c.ramp), region=region)
+        if c.kind == "rain":
+            flux = self.grown(frame.length / frame.time * c.value[0], c.ramp)
+            pond, driest = (frame.stress * p for p in c.value[1:])
+            return mpm.Rain(side, flux, ponding=pond, driest=driest, region=region)
         if c.kind == "springs":
             stiffness = c.value[0] * frame.stress / frame.length
 
@@ -348,6 +358,11 @@ def shown(built: Built) -> Shown:
     }
     if scene.fluid is not None:
         fields["pressure"] = points.pressure[own] / frame.stress
+    if any(law.get("retention") for _, law in scene.materials):
+        fields["saturation"] = s.point_fields().saturation[own]
+    if any(c.kind == "rain" for c in scene.conditions):
+        volumes = [s.outcome(name).array.sum() for name in ("ran_off", "ponded")]
+        fields["rain"] = np.array(volumes) / (frame.flow(scene) * frame.time)
     fields["reactions"] = frame.vector_back(
         s.reactions.array.reshape(-1, d)[built.own("displacements")] / frame.force(scene)
     )

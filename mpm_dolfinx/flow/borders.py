@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: MIT
+"""Where soils of different conductivity meet, whose pores drain: faces between cells, and cells that hold several.
+
+Fluxes through these faces are those of `series`; all others are two-point ones as UFL has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.fluid_content import mean_density
+from mpm_dolfinx.base.tolerances import EPSILON
+from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility
+from mpm_dolfinx.flow.layers import MixedCells
+from mpm_dolfinx.flow.series import Through, Ways, none, through
+from mpm_dolfinx.flow.unsaturated import Laws
+from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import over_all
+
+
+class Borders:
+    """Faces between cells that do not conduct alike since the grid was reset.
+
+    Parameters
+    ----------
+    contents
+        What the cells hold.
+    cells, alike, law
+        Of pieces (m,): their cells, what those (m, k) have in common that conduct alike, and their laws of retention.
+    facets
+        Faces of this process between two active cells.
+    mixed
+        Cells that hold several soils, if any do.
+    """
+
+    def __init__(
+        self,
+        contents: CellContents,
+        cells: NDArray[np.int32],
+        alike: NDArray[np.float64],
+        law: NDArray[np.int64],
+        facets: NDArray[np.int32],
+        mixed: MixedCells | None,
+    ):
+        self._grid = grid = contents.grid
+        known = np.zeros((grid.num_local, 2 + alike.shape[1]))
+        known[cells, 1:] = np.column_stack([law, alike])
+        self.mixed = np.full(grid.num_local, -1)
+        """Numbers of the owned cells that hold several soils among these, else -1."""
+        if mixed is not None:
+            self.mixed[mixed.cells] = np.arange(len(mixed.cells))
+            known[mixed.cells, 0] = 1.0
+        known = with_ghosts(grid, known)
+        self._place = np.zeros(grid.num_local, dtype=np.int64)
+        self._place[contents.filled] = np.arange(len(contents.filled))
+        self._law = known[:, 1].astype(np.int64)
+        first, other = grid.facet_cells[facets].T
+        differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
+        self.facets, self.alike = facets[differ], facets[~differ]
+        """Faces of this process between cells that do not conduct alike, and the other ones."""
+        way = grid.midpoints[grid.facet_cells[self.facets]]
+        way = way[:, 1] - way[:, 0]
+        self._axis = np.abs(way).argmax(axis=1)
+        falls = np.take_along_axis(way, self._axis[:, None], axis=1) < 0
+        self._pair = np.where(falls, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
+        self._cells, slot = np.unique(self._pair, return_inverse=True)
+        self._slot = slot.reshape(self._pair.shape)
+
+    def faces(
+        self, laws: Laws, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
+    ) -> BorderFaces:
+        """Return the faces as the cells conduct.
+
+        Parameters
+        ----------
+        laws
+            Of the conductivities by the pressure.
+        contents, flow
+            What the cells hold, and how the filled owned ones conduct.
+        places, moved
+            Of the local cells (c, d), m: places of their pressures from their midpoints, and how they have moved since.
+        """
+        grid, d = self._grid, self._grid.dim
+        ways, slots = flow.mobility.ways, 1
+        if ways is not None:
+            slots = ways.law.shape[-1]
+            plain = replace(flow, mobility=Mobility(np.ones(len(contents.filled))))
+            held = contents.slot(np.flatnonzero(self.mixed >= 0))
+            ways = ways.eased(plain.along(d)[held])
+        slots = int(over_all(grid.comm, slots, MPI.MAX))
+        own = np.flatnonzero(self._cells < grid.num_owned)
+        cells, along = self._cells[own], flow.along(d)
+        out = none(len(self._cells), len(laws.scales), slots).everywhere(d)
+        out.beside[own, :, :, self._law[cells]] = along[contents.slot(cells)][:, :, None]
+        mixed = self.mixed[cells] >= 0
+        if ways is not None:
+            for of, given in zip(out, ways.with_slots(slots), strict=True):
+                of[own[mixed]] = given[self.mixed[cells[mixed]]]
+        out = self._from_others(out)
+        (first, other), axis = self._pair, self._axis
+        h = grid.sizes(np.concatenate([first, other]))
+        h = np.broadcast_to(h, (2 * len(axis), d)).reshape(2, len(axis), d)
+        rows, unit = np.arange(len(axis)), np.eye(d)[axis]
+        across = h[:, rows, axis]
+        lengths = [
+            across[i] / 2 - sign * places[cells, axis] for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
+        ]
+        lengths = [np.maximum(length, EPSILON * way) for length, way in zip(lengths, across, strict=True)]
+        gone = moved + places - contents.centroid
+        drift = (gone[other] - gone[first]) / 2  # what the middle of a face moves by is shared
+        apart = [
+            across[i][:, None] / 2 * unit - sign * contents.centroid[cells] + drift
+            for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
+        ]
+        area = np.minimum(contents.open[first, axis, 1], contents.open[other, axis, 0])
+        area = area * np.broadcast_to(grid.volumes(first), len(axis)) / across[0]
+        two = [out.at(self._slot[0], axis, 1), out.at(self._slot[1], axis, 0)]
+        weight = np.zeros(d) if flow.weight is None else flow.weight
+        return BorderFaces(laws, self._pair, area, two, lengths, apart, weight, flow.bulk, grid)
+
+    def through_sides(
+        self,
+        laws: Laws,
+        mobility: Mobility,
+        cells: NDArray[np.int32],
+        normal: NDArray[np.float64],
+        p: NDArray[np.float64],
+        outer: NDArray[np.float64],
+        fall: NDArray[np.float64],
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+        """Yield rows of owned cells that hold several soils, and k_r (k,) and slopes of these: see `Relative`."""
+        rows = np.flatnonzero(self.mixed[cells] >= 0)
+        if not len(rows):
+            return
+        mixed, count = self.mixed[cells[rows]], len(rows)
+        slot = self._place[cells[rows]]
+        share = normal[rows] ** 2
+        across = mobility.mean[slot] * (share * mobility.share[slot]).sum(axis=1)
+        found, ones = np.zeros((2, count)), np.ones(count)
+        for axis in range(normal.shape[1]):
+            way = mobility.ways.at(mixed, axis, (normal[rows, axis] > 0).astype(np.int64))
+            some = through(laws, (p[rows], outer[rows]), [way], [ones], [fall[rows]])
+            found += share[:, axis] * np.stack([some.conductance, some.slopes[0]])
+        yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
+
+    def _from_others(self, ways: Ways) -> Ways:
+        """Return ways of the cells beside these faces, those of ghosts as their owners have them."""
+        if self._grid.comm.size == 1:
+            return ways
+        columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in ways]
+        width = np.cumsum([column.shape[1] for column in columns])
+        rows = np.zeros((self._grid.num_local, width[-1]))
+        rows[self._cells] = np.concatenate(columns, axis=1)
+        found = np.split(with_ghosts(self._grid, rows)[self._cells], width[:-1], axis=1)
+        return Ways(*(part.reshape(of.shape).astype(of.dtype) for part, of in zip(found, ways, strict=True)))
+
+
+@dataclass
+class BorderFaces:
+    """Faces between cells that do not conduct alike, as these conduct.
+
+    laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); ways, lengths, apart: two each, of the cells, see
+    `through`, and vectors (m, d), m; weight (d,): of the fluid, N/m^3; bulk: its bulk modulus, Pa.
+    """
+
+    laws: Laws
+    pair: NDArray[np.int64]
+    area: NDArray[np.float64]
+    ways: list[Ways]
+    lengths: list[NDArray[np.float64]]
+    apart: list[NDArray[np.float64]]
+    weight: NDArray[np.float64]
+    bulk: float
+    grid: Grid
+    force: NDArray[np.float64] | None = None
+    """Force of inertia on the fluid (c, d), N/m^3, in the local cells, if there is any."""
+    _found_at: NDArray[np.float64] | None = None
+
+    def set_force(self, cells: NDArray[np.int64], force: NDArray[np.float64]) -> None:
+        """Set the force of inertia on the fluid (n, d), N/m^3, in the active owned cells (n,)."""
+        self.force, self._found_at = np.zeros((self.grid.num_local, self.grid.dim)), None
+        self.force[cells] = force
+        self.force = with_ghosts(self.grid, self.force)
+
+    def set_pressures(self, p: NDArray[np.float64]) -> None:
+        """Find the fluxes at pressures of the local cells (c,), Pa."""
+        pair = p[self.pair]
+        if self._found_at is not None and np.array_equal(self._found_at, pair):
+            return
+        self._found_at = pair
+        weight = self.weight if self.force is None else self.weight + self.force[self.pair].mean(axis=0)
+        falls = [(way * weight).sum(axis=1) for way in self.apart]
+        found: Through = through(self.laws, pair, self.ways, self.lengths, falls)
+        density = self.area * mean_density(*pair, self.bulk)
+        self._flux = density * found.conductance * (pair[0] - pair[1] + sum(falls))
+        self._slopes = [density * slope for slope in found.slopes]
+
+    def add_fluxes(self, out: NDArray[np.float64]) -> None:
+        """Add the outflows of the local cells (c,), m^d/s."""
+        for cells, sign in zip(self.pair, (1, -1), strict=True):
+            np.add.at(out, cells, sign * self._flux)
+
+    def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
+        """Add the slopes of the outflows to a matrix; the caller finalises it."""
+        if not len(self.area):
+            return
+        number = unknowns.map.indices[self.pair]
+        own, other = self._slopes
+        values = np.stack([np.stack([own, -other], axis=1), np.stack([-own, other], axis=1)])
+        columns = np.broadcast_to(number.T, values.shape)
+        starts = np.arange(0, values.size + 1, 2)
+        A.setValuesIJV(
+            starts.astype(PETSc.IntType),
+            columns.ravel().astype(PETSc.IntType),
+            values.ravel(),
+            addv=True,
+            rowmap=number.ravel().astype(PETSc.IntType),
+        )
+
+
+def with_ghosts(grid: Grid, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows (c, k) of the local cells, those of ghosts as their owners have them."""
+    if grid.comm.size == 1:
+        return rows
+    carrier, out = fem.Function(grid.cellwise()), np.empty_like(rows)
+    for i, column in enumerate(rows.T):
+        carrier.x.array[:] = column
+        carrier.x.scatter_forward()
+        out[:, i] = carrier.x.array
+    return out

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: MIT
+"""Fluxes through soils in series whose conductivities depend on the pressure: those between the places of two cells.
+
+On the way from the place of a cell's pressure to a face, and on to that of the next, soils lie one after the other.
+The pressures where they meet are unknowns of each face.  They are solved for by Newton's method, as what flows through
+one soil flows on through the next, and are condensed.  Each soil conducts as between two cells of its own (`fitted`).
+So steady flow through layers of exponential soil is met exactly, wherever they meet on the grid.
+
+Lines through a cell, see `layers`, that meet one soil only on their way to a face conduct side by side; on those that
+meet several each takes its mean share of the way, in the order in which they are met.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import EPSILON, SAME, TINY
+from mpm_dolfinx.flow.unsaturated import Laws
+
+FARTHEST = 2.0
+"""Change of the logarithm of a suction between two soils in a step of Newton's method, at most."""
+MOST = 200  # Source: exact bound
+
+
+class Ways(NamedTuple):
+    """Ways from the places of n cells' pressures to the ends of what they hold; arrays (n, d, 2, ...) by axis and end.
+
+    beside (l,): mobilities, m^2/(Pa s), of lines that meet soil of one law only, by their share of all lines; the first
+    law is that of full pores.  Of the others, s soils one after the other: law (s,), -1 where there are less; length
+    (s,), of the way; resistance (s,), of the length by mobility and share of the lines, Pa s/m^2.
+    """
+
+    beside: NDArray[np.float64]
+    law: NDArray[np.int64]
+    length: NDArray[np.float64]
+    resistance: NDArray[np.float64]
+
+    def at(self, *index) -> Ways:
+        """Return some of them."""
+        return Ways(*(values[index] for values in self))
+
+    def everywhere(self, dim: int) -> Ways:
+        """Return the same ways (n, ...) to both ends along all axes (n, d, 2, ...)."""
+        parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
+        return Ways(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
+
+    def with_slots(self, count: int) -> Ways:
+        """Return them with room for so many soils one after the other."""
+        more = [(0, 0)] * (self.law.ndim - 1) + [(0, count - self.law.shape[-1])]
+        law, length, resistance = (
+            np.pad(values, more, constant_values=v) for values, v in zip(self[1:], (-1, 0, 0), strict=True)
+        )
+        return Ways(self.beside, law, length, resistance)
+
+    def eased(self, factor: NDArray[np.float64]) -> Ways:
+        """Return ways (n, d, 2, ...) that conduct so many times as well along the axes (n, d)."""
+        factor = factor[:, :, None, None]
+        return self._replace(beside=self.beside * factor, resistance=self.resistance / factor)
+
+
+class Through(NamedTuple):
+    """Conductances (m,), m^2/(Pa s) over a length, and the slopes of the flux by the pressures on both sides."""
+
+    conductance: NDArray[np.float64]
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def none(count: int, laws: int, slots: int) -> Ways:
+    """Return ways (count, ...) along which nothing conducts."""
+    return Ways(
+        np.zeros((count, laws)),
+        np.full((count, slots), -1),
+        np.zeros((count, slots)),
+        np.zeros((count, slots)),
+    )
+
+
+class _Links(NamedTuple):
+    """Soils between nodes of m faces, flat: face, nodes, law, conductance, and what the weight drives by, Pa."""
+
+    face: NDArray[np.int64]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    law: NDArray[np.int64]
+    conductance: NDArray[np.float64]
+    fall: NDArray[np.float64]
+
+
+class _Flows(NamedTuple):
+    """Conductances of links, slopes of their fluxes by the pressures at both nodes, fluxes, and their rounding."""
+
+    k: NDArray[np.float64]
+    own: NDArray[np.float64]
+    other: NDArray[np.float64]
+    flux: NDArray[np.float64]
+    rounding: NDArray[np.float64]
+
+
+def through(
+    laws: Laws,
+    p: Sequence[NDArray[np.float64]],
+    ways: Sequence[Ways],
+    lengths: Sequence[NDArray[np.float64]],
+    falls: Sequence[NDArray[np.float64]],
+) -> Through:
+    """Return how faces conduct between two pressures.
+
+    Parameters
+    ----------
+    laws
+        Of the conductivities.
+    p
+        Pressures on both sides (m,), Pa.
+    ways
+        Of one or two cells (m, ...): from the first place to the face, and from the second one.
+    lengths
+        Of these ways (m,), m.
+    falls
+        What the fluid's weight drives by along each, from the first side to the second (m,), Pa.
+    """
+    counts = [np.maximum((way.law >= 0).sum(axis=1), 1) for way in ways]
+    kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
+    out = np.zeros((3, len(p[0])))
+    for i, count in enumerate(kinds):
+        rows = np.flatnonzero(kind.ravel() == i)
+        of = [[values[rows] for values in each] for each in (p, lengths, falls)]
+        out[:, rows] = _Chain(laws, [way.at(rows) for way in ways], count.tolist(), *of).solved()
+    return Through(out[0], (out[1], out[2]))
+
+
+class _Chain:
+    """Faces that have as many soils one after the other on their ways, with a node between each two."""
+
+    def __init__(self, laws: Laws, ways: Sequence[Ways], count: Sequence[int], p, lengths, falls):
+        self._laws, self._p = laws, p
+        self._size, self._nodes = len(p[0]), sum(count) + 1
+        self._counts = count
+        faces = np.arange(self._size)
+        links, rest = [], [p[0]]
+        for side, way in enumerate(ways):
+            first, fall = len(rest) - 1, falls[side]
+            for j in range(count[side]):
+                slot = count[side] - 1 - j if side else j  # the second way begins at its place
+                held = way.law[:, slot] >= 0
+                part = np.where(held, way.length[:, slot], 1.0) * fall
+                with np.errstate(divide="ignore"):
+                    conducts = np.where(held, 1 / (way.resistance[:, slot] * lengths[side]), 0.0)
+                node = np.full(self._size, first + j)
+                links.append(_Links(faces, node, node + 1, np.maximum(way.law[:, slot], 0), conducts, part))
+                rest.append(rest[-1] + part)
+            face, law = np.nonzero(way.beside)
+            low, high = (np.full(len(face), node) for node in (first, len(rest) - 1))
+            links.append(_Links(face, low, high, law, way.beside[face, law] / lengths[side][face], fall[face]))
+        self._parts = np.cumsum([0, *(len(one.face) for one in links)])
+        self._links = _Links(*(np.concatenate(parts) for parts in zip(*links, strict=True)))
+        self._rest = np.stack(rest, axis=1)
+        self._drives = self._rest[:, -1] - p[1]
+
+    def solved(self) -> NDArray[np.float64]:
+        """Return conductances and slopes (3, m)."""
+        links, inner, drives = self._links, slice(1, -1), self._drives[:, None]
+        scale = np.full(self._rest.shape, np.inf)
+        for node in (links.low, links.high):
+            np.minimum.at(scale, (links.face, node), self._laws.scales[links.law])
+        scale = scale[:, inner]
+        low, high = np.sort([self._rest, self._rest - drives], axis=0)[:, :, inner]
+        size = np.minimum(scale, np.abs(low) + np.abs(high))
+        done, most, went = self._nodes == 2, np.full(scale.shape, FARTHEST), np.zeros(scale.shape)
+        p = self._rest - np.arange(self._nodes) / (self._nodes - 1) * drives
+        p[:, -1] = self._p[1]
+        for _ in range(MOST):
+            flows = self._flows(p)
+            if done:
+                return self._condensed(flows)
+            here = p[:, inner].copy()
+            step, met = self._step(flows)
+            if self._nodes == 3:
+                low, high = np.where(step > 0, here, low), np.where(step < 0, here, high)
+            there = np.clip(here + step, low, high)
+            y, to = np.arcsinh(here / scale), np.arcsinh(there / scale)
+            # where it would turn back, no further than half of the way
+            most = np.minimum(np.where(went * (to - y) < 0, np.abs(went) / 2, 1.25 * most), FARTHEST)
+            far = (np.abs(to - y) > most) & (np.minimum(y, to) < 0)
+            went = np.where(far, np.clip(to - y, -most, most), to - y)
+            there = np.where(far, (scale * np.sinh(np.where(far, y + went, 0.0))).clip(low, high), there)
+            done = (met | (np.abs(there - here) <= SAME * (np.abs(here) + size))).all()
+            p[:, inner] = np.where(met, here, there)
+        raise NotConverged("soils in series: no pressure is found where they meet")
+
+    def _flows(self, p: NDArray[np.float64]) -> _Flows:
+        """Return the flows at pressures of the nodes (m, nodes), Pa."""
+        links = self._links
+        ends = p[links.face, links.low], p[links.face, links.high]
+        k, slopes = self._laws.between(links.law, ends, links.fall)
+        drives, c = ends[0] - ends[1] + links.fall, links.conductance
+        rounding = 4 * EPSILON * c * (k + EPSILON**2) * (np.abs(ends[0]) + np.abs(ends[1]) + np.abs(links.fall))
+        own, other = (np.maximum(k + sign * drives * slope, 0.0) for sign, slope in zip((1, -1), slopes, strict=True))
+        return _Flows(c * k, c * own, c * other, c * k * drives, rounding)
+
+    def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return those of links that follow one another (m, nodes - 1)."""
+        here = np.cumsum([0, *(count + 1 for count in self._counts)])
+        number = [i for first, count in zip(here, self._counts, strict=False) for i in range(first, first + count)]
+        return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
+
+    def _step(self, flows: _Flows) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return steps (m, nodes - 2) of Newton's method, and where what flows in flows on but for rounding."""
+        links, shape = self._links, self._rest.shape
+
+        def at(node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.bincount(links.face * shape[1] + node, values, shape[0] * shape[1]).reshape(shape)[:, 1:-1]
+
+        x = at(links.high, flows.flux) - at(links.low, flows.flux)
+        met = np.abs(x) <= at(links.high, flows.rounding) + at(links.low, flows.rounding)
+        diagonal = at(links.high, flows.other) + at(links.low, flows.own) + TINY
+        own, other = (self._chain(values)[:, 1:-1] for values in (flows.own, flows.other))
+        for i in range(x.shape[1] - 1):  # Thomas's algorithm
+            share = own[:, i] / diagonal[:, i]
+            diagonal[:, i + 1] = np.maximum(diagonal[:, i + 1] - share * other[:, i], EPSILON * diagonal[:, i + 1])
+            x[:, i + 1] += share * x[:, i]
+        x[:, -1] /= diagonal[:, -1]
+        for i in range(x.shape[1] - 1)[::-1]:
+            x[:, i] = (x[:, i] + other[:, i] * x[:, i + 1]) / diagonal[:, i]
+        return x, met
+
+    def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
+        """Return conductances and slopes (3, m) between the ends: in series along a way, side by side with others."""
+        out, rows, part = None, np.stack(flows[:3]), 0
+        for count in self._counts:
+            way = None
+            for i in range(part, part + count):
+                way = _series(way, rows[:, self._parts[i] : self._parts[i + 1]])
+            part += count + 1
+            beside = slice(self._parts[part - 1], self._parts[part])
+            face = self._links.face[beside]
+            out = _series(out, way + np.stack([np.bincount(face, row[beside], self._size) for row in rows]))
+        return out
+
+
+def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return conductance and slopes (3, m) of two in series, of the second where there is no first."""
+    if first is None:
+        return second
+    (k, own, other), (after, owns, others) = first, second
+    both = owns + other + TINY
+    return np.stack([k * (after / (k + after + TINY)), own * (owns / both), other * (others / both)])

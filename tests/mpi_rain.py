@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: MIT
+"""Let rain fall on sand beside loam, which is carried along as it gets wet, and write the state."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([0, 0], [2.4, 1.2], [16, 8])
+soils = [
+    mpm.Hencky(1e7, 5e6, conductivity=k, retention=law)
+    for k, law in ((1e-5, mpm.VanGenuchten(3e3, residual=0.1, n=2.5)), (1e-6, mpm.BrooksCorey(5e3, index=1.5)))
+]
+edges = (0.3, 0.97, 1.6)
+bodies = [mpm.box(grid, [edges[i], 0], [edges[i + 1], 1.03], material=i) for i in range(2)]
+simulation = mpm.Simulation(
+    grid,
+    bodies,
+    soils,
+    fluid=mpm.Fluid(),
+    walls={"bottom": "y"},
+    conditions=[
+        mpm.Rain("top", 5e-5, ponding=50.0, name="rain"),
+        mpm.Drained("bottom", 2e3),
+        *[mpm.Displacement(side, lambda t: (2e-4 * t, 0), "x") for side in ("left", "right")],
+    ],
+    gravity=(0, -9.81),
+    pressure=-5e3,
+    initial_stress=mpm.K0(0.5),
+    numerics=mpm.Numerics(tolerance=1e-10),
+)
+result = simulation.run(1800.0, 300.0, progress=False)
+points, cells = simulation.points, simulation.cells()
+volumes = [simulation.outcome(name).array for name in ("flowed", "ponded", "ran_off")]
+water = grid.comm.allreduce(cells.water.sum())
+parts = grid.comm.gather((points.id, points.x, points.pressure, points.displacement))
+if parts:
+    ids, x, p, u = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    assert volumes[2].sum() > 0, "nothing runs off"
+    np.savez(
+        sys.argv[1],
+        x=x[order],
+        p=p[order],
+        u=u[order],
+        volumes=np.concatenate(volumes),
+        water=water,
+        balance=result.balance,
+        counts=[len(part[0]) for part in parts],
+    )
