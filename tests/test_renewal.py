@@ -248,6 +248,32 @@ def test_wet_clay_flows_around_a_bar(rate, cells=4, depth=1.0):
     assert (N[1:] / N[:-1])[24:].min() > 0.9
 
 
+@pytest.mark.slow
+def test_clay_is_pressed_through_a_die_of_half_its_width(cells=9, depth=1.0, strength=1e3):
+    """Hill's pressure (1950) of a smooth square die is strength (1 + pi / 2), whatever the way.
+
+    The die's edge lies in the middle of a cell, rounded by a cell: over a sharp one the surface catches.
+    """
+    h, long = 1 / cells, depth + 1.5
+    low, high = -np.ceil((2 * depth + 0.75) * cells) / cells, np.ceil((long + 0.25) * cells) / cells
+    grid = mpm.Grid([0, low + h / 2], [1, high + h / 2], [cells, round((high - low) * cells)])
+    angle = np.linspace(np.pi, np.pi / 2, 7)
+    edge = np.stack([0.5 + h + h * np.cos(angle), -h + h * np.sin(angle)], axis=1)
+    outline = np.concatenate([[[0, -0.25], [0.5, -0.25]], edge, [[1, 0], [1, long], [0, long]]])
+    billet = mpm.polygon(grid, outline, ["exit", "land", *["die"] * 7, "right", "top", "left"])
+    soil = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=strength)
+    die = mpm.Tool(mpm.Convex([*edge, [0.5, -0.5], [1.5, -0.5], [1.5, 0]]))
+    ram = mpm.Tool(mpm.HalfSpace((0, long), (0, -1)), lambda t: (0, -t), name="ram")
+    options = {"walls": {"left": "x", "right": "x"}, "numerics": mpm.Numerics(renewal=True)}
+    s = mpm.Simulation(grid, [billet], [soil], conditions=[die, ram], **options)
+    result = s.run(depth, h / 8, progress=False)
+    p = -result.tool_forces["ram"][1:, 1] / strength / (1 + np.pi / 2)
+    print(f"p over the exact one, means over cells: {np.round(p[: 8 * cells].reshape(-1, 8).mean(axis=1), 3)}")
+    assert result.converged and result.renewals > 5
+    assert p.mean() == pytest.approx(1, abs=0.04)
+    assert p[8:] == pytest.approx(1, abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("processes", "wet"),
     [(1, False), (3, True), *(pytest.param(2, wet, marks=pytest.mark.slow) for wet in (False, True))],
