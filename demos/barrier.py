@@ -39,7 +39,7 @@ ANGLES = np.radians(np.linspace(20, 85, 261))  # of the planes of wedges
 
 
 def bank(cells: int, barrier: bool) -> mpm.Simulation:
-    """Return the bank at rest, with so many cells over its height; t is zero."""
+    """Return the bank at rest, with a number of cells over its height; t is zero."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
     clay = mpm.DruckerPrager(
@@ -102,7 +102,7 @@ class Slump:
 
 
 def slump(cells: int, steps: int, barrier: bool) -> Slump:
-    """Let the bank lose its cohesion in so many steps, and come to rest."""
+    """Let the bank lose its cohesion in a number of steps, and come to rest."""
     s, out, dt = bank(cells, barrier), Slump(), DURATION / steps
     start = s.points.x
 

@@ -113,7 +113,7 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with four layers, of two conductivities in turn, so many cells off the grid lines."""
+    """Return the draining block with four layers of alternating conductivity, at an offset of cells from grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
@@ -138,7 +138,7 @@ def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
 
 
 def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
-    """Return the sealed block of plastic soil, with the damping of pressure jumps for yielding or for elastic soil."""
+    """Return the undrained block of plastic soil, with damping of pressure jumps for yielding or elastic soil."""
     simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
     if not yields:
         simulation.scene.materials._softness.clear()

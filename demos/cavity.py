@@ -76,7 +76,7 @@ def ray(X: np.ndarray) -> np.ndarray:
 
 
 def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
-    """Return a quarter of the ring, with so many cells over the hole's radius, which is 1 + t.
+    """Return a quarter of the ring, with a number of cells over the hole's radius, which is 1 + t.
 
     outside: displacement of its outside, m, at a time; widest: the largest radius of the hole.
     """

@@ -82,7 +82,7 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the bund on cells of size h, m, with so many steps between two lifts, 6 times as many after."""
+    """Build the bund on cells of size h, m, with a number of steps between two lifts, and 6 times as many after."""
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

@@ -29,7 +29,7 @@ BOUNDS = {"slides": 0.005, "rolls": 0.01, "flies": 0.001, "energy": 0.03}
 
 
 def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
-    """Return box and balls above the incline, so many cells over a radius, and which points are of each."""
+    """Return box and balls above the incline, with cells over a radius, and the points of each."""
     h = RADIUS / cells
     size = np.array([2.3, 1.75])
     grid = mpm.Grid([0, 0], (np.ceil(size / h) * h).tolist(), np.ceil(size / h).astype(int).tolist())

@@ -64,7 +64,7 @@ def contact(s: mpm.Simulation) -> Contact:
 
 
 def scene(cells: int, wet: bool) -> mpm.Simulation:
-    """Return half of the gel under the cylinder, with so many cells to a metre."""
+    """Return half of the gel under the cylinder, with a number of cells to a metre."""
     n, h = round(SIZE * cells), 1 / cells
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
     top = SIZE + 0.3 * h  # the surface is no line of the grid

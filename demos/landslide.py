@@ -26,7 +26,7 @@ BALANCE = 0.01  # share of the work of the weight by which energies may be off
 
 
 def slope(cells: int) -> mpm.Simulation:
-    """Return the slope at rest, with so many cells over its height."""
+    """Return the slope at rest, with a number of cells over its height."""
     grid, bodies = still.shape(cells)
     soil = mpm.MohrCoulomb(
         bulk=still.YOUNG / (3 - 6 * still.POISSON),

@@ -59,7 +59,7 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return angles, 0 ahead of the bar, between so many domains, and more where widths fall to `nose` times theirs."""
+    """Return angles, 0 ahead of the bar, between a number of domains, more where widths fall to `nose` times theirs."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -69,7 +69,7 @@ def angles(around: int, nose: float) -> np.ndarray:
 
 
 def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
-    """Return a grid with so many cells over the diameter, half of the block around a bar at y, m, its top's region."""
+    """Return a grid by its cells over the diameter, half of the block around a bar at y, m, and its top's region."""
     h = D / cells
     n = round(HALF * cells)
     grid = mpm.Grid([0, -HALF], [HALF, HALF + 4 * h], [n, 2 * n + 4])
@@ -108,7 +108,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float) -> Push:
-    """Press the clay, then push a bar of roughness alpha to a depth, over D, in clay that is seeded anew on the way."""
+    """Press the clay, then push a bar of roughness alpha to a depth, over D, with clay seeded again in each part."""
     out, stress, legs = Push(), None, max(1, round(depth / LEG))
     for k in range(legs):
         stress = leg(out, stress, alpha, cells, depth * (0.5 - k / legs), depth / legs)

@@ -32,7 +32,7 @@ TIMES = (0.25, 0.5, 1.0, 2.0, 20.0)  # days
 
 
 def column(cells: int) -> mpm.Simulation:
-    """Return the column at rest, of so many cells across the slope, its foot at the water table."""
+    """Return the column at rest with cells across the slope, and its foot at the water table."""
     height = TABLE * np.cos(SLOPE)
     h = height / cells
     grid = mpm.Grid([0, 0], [h, height + 2 * h], [1, cells + 2])

@@ -60,7 +60,7 @@ SOLVERS = ("factorisation", "linear solve")
 
 
 def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
-    """Return a body of about so many points, and its time step, s."""
+    """Return a body of about a number of points, and its time step, s."""
     if dim == 2:
         h = np.sqrt(4 * beam.LENGTH * beam.HEIGHT / points)
         return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02

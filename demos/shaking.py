@@ -41,7 +41,7 @@ def incoming(t: np.ndarray) -> np.ndarray:
 
 
 def shaken(cells: int, steps: int) -> tuple[mpm.Result, np.ndarray]:
-    """Return a run of so many steps with cells over the layer, and the velocity of the surface, m/s."""
+    """Return a run with numbers of steps and of cells over the layer, and the velocity of the surface, m/s."""
     h = LAYER / cells
     rows = round(GROUND / h)
     grid = mpm.Grid([0, -GROUND - h], [4 * h, LAYER + h], [4, cells + rows + 2])

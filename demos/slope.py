@@ -28,7 +28,7 @@ VISCOSITY = 0.1 * WEIGHT * HEIGHT  # Pa s
 
 
 def shape(cells: int) -> tuple[mpm.Grid, list[mpm.Body]]:
-    """Return the grid, with so many cells over the slope's height, and ground and bank."""
+    """Return the grid, with a number of cells over the slope's height, and ground and bank."""
     h, middle = HEIGHT / cells, CREST + RUN / 2
     columns, rows = round((CREST + RUN + BEFORE) / h), round(DEPTH / h)
     length = columns * h
@@ -43,7 +43,7 @@ def shape(cells: int) -> tuple[mpm.Grid, list[mpm.Body]]:
 
 
 def slope(cells: int) -> mpm.Simulation:
-    """Return the slope at rest, with so many cells over its height; t is zero."""
+    """Return the slope at rest, with a number of cells over its height; t is zero."""
     grid, bodies = shape(cells)
     soil = mpm.MohrCoulomb(
         bulk=YOUNG / (3 - 6 * POISSON),

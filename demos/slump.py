@@ -49,7 +49,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank with so many cells over its height, `room` m before it, and a probe on its crest."""
+    """Return the consolidated bank by the cells over its height, `room` m before it, and a probe on its crest."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -173,7 +173,7 @@ def at_toe(s: mpm.Simulation) -> float:
 
 
 def slump(cells: int, steps: int) -> Slump:
-    """Let the bank lose its cohesion in so many steps, come to rest, and drain."""
+    """Let the bank lose its cohesion in a number of steps, come to rest, and drain."""
     sides = [mpm.Drained("top"), mpm.Drained("right")]
     s, _ = bank(
         cells,

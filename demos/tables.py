@@ -64,7 +64,7 @@ def figures(run: str, entries: str, form: str) -> str:
 
 
 def written(page: str) -> str:
-    """Return a page with its figures and tables written anew."""
+    """Return a page with its figures and tables written again."""
     page = FIGURE.sub(lambda m: f"{figures(m['run'], m['entries'], m['form'])} {m['comment']}", page)
     return TABLE.sub(lambda m: m["begin"] + kept(m["run"]).with_suffix(".md").read_text() + m["end"], page)
 

@@ -44,7 +44,7 @@ def path(t: float) -> tuple[float, float]:
 
 
 def scene(cells: int) -> mpm.Simulation:
-    """Return the two gels, with so many cells over a radius."""
+    """Return the two gels, with a number of cells over a radius."""
     grid = mpm.Grid([0, 0], [4.5, 2.25], [round(4.5 * cells), round(2.25 * cells)])
     low, high = (1.5, 0.0), (1.5, 2 * RADIUS + GAP)
     bodies = [half_disc(grid, low, 1.0), half_disc(grid, high, -1.0)]

@@ -80,7 +80,7 @@ def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def own_loss(t: np.ndarray, steps: int) -> np.ndarray:
-    """Return the energy that SDIRK2 leaves after t periods of so many steps."""
+    """Return the energy that SDIRK2 leaves after t periods with a number of steps each."""
     y = (GAMMA * 2 * np.pi / steps) ** 2
     return (1 - (y / (1 + y)) ** 2) ** (t * steps)
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Soil that collapses as it gets wet: closed forms of the Barcelona Basic Model in Bishop's stress, scenes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
+import ufl
 from helpers import set_up
 from laws import LawAtPoints
 from scenes.comparing import differences
@@ -311,6 +313,28 @@ def test_a_sample_that_may_vibrate_collapses_as_far():
     volume = states(s)[1]
     exact = wetted([0.0])[:, -1]
     assert volume == pytest.approx(exact[0], abs=1e-7)
+
+
+@dataclass(frozen=True)
+class Swelling(mpm.Hencky):
+    """Soil that swells by ln J = swell times what its suction has fallen by, without stress."""
+
+    state: ClassVar = {"suction": 0.0}
+    swell: mpm.Field = 1e-6
+
+    @staticmethod
+    def energy(F, bulk, shear, suction, swell):
+        return mpm.Hencky.energy(F, bulk, shear) + bulk * swell * suction * ufl.ln(ufl.det(F))
+
+
+def test_an_energy_of_the_users_sees_suction():
+    """In a column, (K + 4G / 3) ln J + K swell s = -J (net + chi s)."""
+    soil = Swelling(bulk=3e6, shear=2e6, retention=RETENTION, conductivity=1e-3)
+    s = narrow(soil, 2, lambda t: -S0 * (1 - t / 2e9))
+    s.run(1e9, 5e8, progress=False)
+    held, oedometric = 3e6 * 1e-6 * S0 / 2, 3e6 + 8e6 / 3
+    exact = brentq(lambda x: oedometric * x + held + np.exp(x) * (NET + felt(S0 / 2)), -0.2, 0.2)
+    assert np.log(s.points.J) == pytest.approx(exact, abs=1e-7)
 
 
 # ---- refusals --------------------------------------------------------------------------------------

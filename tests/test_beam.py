@@ -36,7 +36,8 @@ def off(result):
 
 def test_the_tip_is_exact_in_space_and_time(beam):
     errors = off(beam[0])
-    assert errors[0] < 1e-2 and errors[2] < 2.5e-3 and errors[3:].max() < 8e-4, errors
+    # before it drains the tip is off by the cells' own error, 0.19 % in ever smaller steps
+    assert errors[0] < 1e-2 and errors[2] < 2.7e-3 and errors[3:].max() < 5e-4, errors
 
 
 def test_the_tip_is_as_exact_in_half_the_steps_if_their_error_chooses_them():
@@ -77,8 +78,8 @@ def test_fluid_balance_and_residuals_close_in_every_step(beam):
 def test_the_tip_is_the_same_on_all_releases(beam):
     """Recorded with dolfinx 0.5.2."""
     tip = np.array(beam[0].displacement)[:, 0]
-    assert tip[3] == pytest.approx([-0.024847874, -0.230076668], rel=1e-6)
-    assert tip[60] == pytest.approx([-0.063789370, -0.348618584], rel=1e-6)
+    assert tip[3] == pytest.approx([-0.024834357, -0.230016549], rel=1e-6)
+    assert tip[60] == pytest.approx([-0.063750014, -0.348521414], rel=1e-6)
 
 
 @pytest.mark.parametrize("extra", ["", "--bulk 8.3333e6 --shear 3.84615e6"], ids=["nu 0", "nu 0.3"])

@@ -78,12 +78,18 @@ def test_the_columns_stress_is_as_good_as_published(cells):
     assert column_errors(cells)["stress"] < CEILINGS[cells]
 
 
+@pytest.mark.parametrize("cells, ceiling", [(16, 4e-4), (32, 5e-5), (64, 8e-6)])
+def test_the_columns_stress_varies_within_domains(cells, ceiling):
+    """With one gradient a domain errors were 9.8e-4, 3.0e-4, 1.3e-4; its heights were right by chance of the steps."""
+    assert column_errors(cells)["stress"] < ceiling
+
+
 def test_the_columns_stress_converges_with_the_cell_size():
     errors = [column_errors(cells)["stress"] for cells in (4, 8, 16, 32)]
     assert rates(errors).min() > 1.5, errors
 
 
-@pytest.mark.parametrize("cells, ceiling", [(16, 2e-4), (32, 5e-5), (64, 5e-5)])
+@pytest.mark.parametrize("cells, ceiling", [(16, 4.5e-4), (32, 1.2e-4), (64, 3e-5)])
 def test_the_columns_height_is_exact(cells, ceiling):
     assert column_errors(cells)["height"] < ceiling
 

@@ -22,9 +22,10 @@ MATRICES = st.lists(st.floats(-0.3, 0.3), min_size=9, max_size=9)
 
 
 def test_a_beam_is_free_of_stress_after_cycles():
-    """0.43 % are left after four and after eight; `demos/run.sh cycles` has twenty."""
+    """0.34 % are left after eight, and after twenty; `demos/run.sh cycles` has these."""
     run = cycles.cycle(0.03, 54e3, 8, 10)
-    assert run["left"][-1] < 4.5e-3 and run["left"][-1] < 1.02 * run["left"][3]
+    left = run["left"]
+    assert left[-1] < 3.5e-3 and left[-1] - left[5] < 0.5 * (left[5] - left[3])
     peaks, rest = run["tips"][5::10], run["tips"][::10]
     assert abs(peaks[-1] / peaks[0] - 1) < 5e-5 and abs(rest[-1] / peaks[0]) < 1e-3
     assert (run["lost"] > 0).all() and run["cuts"] == 0

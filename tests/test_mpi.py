@@ -26,14 +26,14 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes rain"
+NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes"
 NAMES = NAMES.split()
 SCENES = [f"mpi_{name}.py" for name in NAMES] + [pytest.param("mpi_wetting.py", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(
     "scene, several",
-    [*((scene, (3,)) for scene in SCENES), pytest.param("mpi_rain.py", (2, 4), marks=pytest.mark.slow)],
+    [*((scene, (3,)) for scene in SCENES), pytest.param("mpi_rain.py", (2, 3, 4), marks=pytest.mark.slow)],
 )
 def test_the_state_is_the_same_on_several_processes(scene, several, tmp_path):
     states = []

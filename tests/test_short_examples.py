@@ -71,7 +71,7 @@ WANTED = {  # number, and relative tolerance
     "export": (export(), 0.01),
     "footing": (2 + np.pi, 0.03),  # Prandtl
     "gel_indentation": (0.2, 0.04),  # of the gel's moduli
-    "landslide": (9.4, 0.05),  # cells and steps of half the size
+    "landslide": (6.6, 0.05),  # cells and steps of half the size
     "mesh_from_gmsh": (mesh_from_gmsh(), 0.01),
     "mesh_from_meshio": (12 * 0.6 * 2650 * 9.81 / 1000, 1e-4),  # area times unit weight
     "own_law": (own_law(), 1e-3),
@@ -115,6 +115,13 @@ def test_every_short_example_is_checked_and_in_the_gallery():
         assert f"(short/{name}.py)" in gallery, name
 
 
+def test_pictures_of_the_gallery_are_small_and_those_that_examples_write():
+    written = {name for path in SHORT.values() for name in re.findall(r"\w+\.png", path.read_text())}
+    kept = {path.name: path.stat().st_size for path in (DEMOS / "pictures" / "short").iterdir()}
+    assert written == {*kept} and max(kept.values()) <= 100e3
+    assert {*re.findall(r"pictures/short/(\w+\.png)", (DEMOS / "README.md").read_text())} == written
+
+
 @pytest.mark.parametrize("name", SHORT)
 def test_it_is_short_and_stands_alone(name):
     text = SHORT[name].read_text()
@@ -129,8 +136,6 @@ def test_it_prints_the_number_of_theory_or_of_finer_cells(name):
     assert number(printed) == pytest.approx(wanted, rel=tolerance, abs=0)
     drawn = {f"{name}.png"} & {*re.findall(r"\w+\.png", SHORT[name].read_text())}
     assert pictures == drawn
-    for picture in drawn:
-        assert (DEMOS / "pictures" / "short" / picture).stat().st_size <= 100e3
 
 
 def test_two_processes_print_what_one_prints(tmp_path):
@@ -169,4 +174,5 @@ def test_rain_soaks_into_the_slope_and_weakens_it():
     assert 1.82 == pytest.approx(before, rel=0.05) and after < 0.9 * before  # cells of half the size
     s = variables["simulation"]
     fallen = 4e-6 * 24 * 3600 * (6 + np.hypot(8, 5) + 6)  # m^2, onto crest, slope and foot
-    assert sum(s.outcome("flowed").array) == pytest.approx(-fallen, rel=0.02)
+    infiltrated, ran_off = -sum(s.outcome("flowed").array), sum(s.outcome("ran_off").array)
+    assert infiltrated + ran_off == pytest.approx(fallen, rel=1e-3) and infiltrated > 0.5 * fallen

@@ -76,13 +76,31 @@ def test_a_plot_has_the_domains_and_the_values_of_the_points(field, label):
     s.run(0.02, 0.02, progress=False)
     ax = mpm.plot(s, field, cmap="viridis")
     (drawn,) = ax.collections
-    assert len(drawn.get_paths()) == len(s.points) and ax.child_axes[0].get_ylabel() == label
+    assert len(drawn.get_paths()) == len(s.points) and ax.child_axes[0].get_title(loc="right") == label
     wanted = {"pressure": s.points.pressure, "stress_xx": s.point_fields().stress[:, 0, 0], "J": s.points.J}
     wanted["displacement"] = np.linalg.norm(s.points.displacement, axis=1)
     assert np.array_equal(drawn.get_array(), wanted[field])
     low, high = s.points.corners.min(axis=(0, 1)), s.points.corners.max(axis=(0, 1))
     assert ax.get_xlim()[0] <= low[0] and ax.get_ylim()[1] >= high[1] and ax.get_xlabel() == "x (m)"
     assert mpm.plot(s, field, ax=ax, bar=False) is ax and len(ax.child_axes) == 1
+    matplotlib.pyplot.close("all")
+
+
+def test_a_plot_has_the_stress_of_dry_soil_and_the_saturation_of_unsaturated_soil():
+    dry = column(cells=4, fluid=False)
+    (drawn,) = mpm.plot(dry, "stress_yy").collections
+    assert np.array_equal(drawn.get_array(), dry.point_fields().effective_stress[:, 1, 1])
+    grid = mpm.Grid([0, 0], [0.5, 2.5], [1, 5])
+    silt = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-6, retention=mpm.Gardner(1e4))
+    box = mpm.box(grid, [0, 0], [0.5, 2])
+    given = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(1), "gravity": (0, -9.81)}
+    wet = mpm.Simulation(grid, [box], [silt], walls={"bottom": "xy"}, **given)
+    (drawn,) = mpm.plot(wet, "saturation").collections
+    height = wet.points.x[:, 1]
+    assert np.all(drawn.get_array()[height < 1] == 1)
+    assert np.all(np.diff(drawn.get_array()[np.argsort(height)][height[np.argsort(height)] > 1][::2]) < 0)
+    with pytest.raises(ValueError, match="plot: field = 'saturation', must be one of"):
+        mpm.plot(beam(h=0.1)[0], "saturation")
     matplotlib.pyplot.close("all")
 
 

@@ -220,7 +220,7 @@ def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def rotation_of_a_beam():
-    """Beam turned by 5 ... 90 degrees, held at its end by given displacements: tip, finite elements."""
+    """Beam rotated by 5 ... 90 degrees, with prescribed displacements at its end: tip, finite elements."""
     for angle in (5, 15, 30, 45, 60, 75, 90):
         yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
 

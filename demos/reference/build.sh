@@ -22,7 +22,7 @@ if [ "$1" = notebooks ]; then
 fi
 site=$out/site
 "$python" "$root/demos/reference/pages.py" "$out/docs"
-"$python" -m mkdocs build --strict --quiet --clean -f "$root/demos/reference/mkdocs.yml"
+PYTHONPATH=$root/demos/reference "$python" -m mkdocs build --strict --quiet --clean -f "$root/demos/reference/mkdocs.yml"
 if grep -rnoE "<(script|link|img|iframe)[^>]*(src|href)=\"?(https?:)?//[^\">]*" --include=*.html "$site"; then
     echo "These need the network." >&2
     exit 1

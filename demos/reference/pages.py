@@ -44,13 +44,16 @@ def short(folder: Path) -> str:
     return "\n".join(out)
 
 
+def documented(folder: Path) -> dict[str, str]:
+    """Return the public names of the reference, with the stems of their pages."""
+    texts = {path.stem: path.read_text() for path in folder.glob("*.md")}
+    return {name: stem for stem, text in texts.items() for name in re.findall(r"^::: mpm_dolfinx\.(\w+)$", text, re.M)}
+
+
 def names(folder: Path) -> str:
     """Return a page of all public names with links to them, which a browser finds without a server."""
-    found = {}
-    for path in folder.glob("*.md"):
-        for name in re.findall(r"^::: mpm_dolfinx\.(\w+)$", path.read_text(), re.M):
-            found[name] = path.name
-    rows = [f"* [`{name}`]({found[name]}#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
+    found = documented(folder)
+    rows = [f"* [`{name}`]({found[name]}.md#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
     return "# All names\n\n" + "\n".join(rows) + "\n"
 
 

@@ -11,7 +11,6 @@ ground = mpm.polygon(
 )
 sand = mpm.Hencky(bulk=4e7, shear=2e7, porosity=0.4, grain_density=2650, conductivity=1e-5)
 far = mpm.Drained("far", lambda t, x: 9810 * (9 - x[:, 1]), name="far")  # the water table stays at 9 m
-sheet_pile = mpm.Displacement("wall", (0, 0), "x", name="sheet pile")  # no water passes it
 simulation = mpm.Simulation(
     grid,
     [*lifts, ground],
@@ -25,6 +24,8 @@ simulation = mpm.Simulation(
 )
 for lift in range(3):
     bottom = mpm.Drained("pit" if lift == 2 else "top", name="pit")  # kept dry
+    exposed = ((0, 9 - lift), (20, 10))  # m: no water passes the sheet pile
+    sheet_pile = mpm.Displacement("wall", (0, 0), "x", region=exposed, name="sheet pile")
     simulation.stage(remove=[lift], conditions=[far, sheet_pile, bottom])
     simulation.run(t_end=simulation.t + DAY, dt=DAY / 4)
 print(f"water to be pumped: {DAY * simulation.outflows['pit']:.2f} m^3 a day and metre of the half pit")

@@ -5,8 +5,8 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid(lower=[0, 0], upper=[30, 8], cells=[30, 8])  # m
-slope = mpm.polygon(grid, [(0, 0), (24, 0), (24, 2), (14, 2), (6, 7), (0, 7)], "outline")
+grid = mpm.Grid(lower=[0, 0], upper=[36, 8], cells=[36, 8])  # m
+slope = mpm.polygon(grid, [(0, 0), (36, 0), (36, 2), (14, 2), (6, 7), (0, 7)], "outline")
 clay = mpm.MohrCoulomb(
     bulk=2e7,
     shear=6e6,

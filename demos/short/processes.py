@@ -17,5 +17,7 @@ simulation = mpm.Simulation(
 )
 middle = mpm.probes([ground], [[0, 2]])
 result = simulation.run(t_end=1e5, dt=2e4, probes=middle)  # histories are the same on all processes
-if grid.comm.rank == 0:  # `simulation.points` are those of one process
+axes = mpm.plot(simulation, "displacement_y")  # all processes take part, the first one draws
+if grid.comm.rank == 0:
+    axes.figure.savefig("processes.png", bbox_inches="tight")
     print(f"settlement: {-1000 * result.displacement[-1, 0, 1]:.6f} mm")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A run is interrupted and goes on from its checkpoint, as if it had never stopped."""
+"""An interrupted run continues from its checkpoint, with the result of an uninterrupted one."""
 
 import mpm_dolfinx as mpm
 

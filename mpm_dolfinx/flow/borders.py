@@ -8,23 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mean_density
 from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility
 from mpm_dolfinx.flow.layers import MixedCells
-from mpm_dolfinx.flow.series import Through, Ways, none, through
-from mpm_dolfinx.flow.unsaturated import Laws
-from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.flow.series import Ways, none, through
+from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 
 
 class Borders:
@@ -51,7 +48,7 @@ class Borders:
         facets: NDArray[np.int32],
         mixed: MixedCells | None,
     ):
-        self._grid = grid = contents.grid
+        self.grid = grid = contents.grid
         known = np.zeros((grid.num_local, 2 + alike.shape[1]))
         known[cells, 1:] = np.column_stack([law, alike])
         self.mixed = np.full(grid.num_local, -1)
@@ -59,7 +56,7 @@ class Borders:
         if mixed is not None:
             self.mixed[mixed.cells] = np.arange(len(mixed.cells))
             known[mixed.cells, 0] = 1.0
-        known = with_ghosts(grid, known)
+        known = with_ghosts(grid.cellwise(), known)
         self._place = np.zeros(grid.num_local, dtype=np.int64)
         self._place[contents.filled] = np.arange(len(contents.filled))
         self._law = known[:, 1].astype(np.int64)
@@ -72,11 +69,12 @@ class Borders:
         self._axis = np.abs(way).argmax(axis=1)
         falls = np.take_along_axis(way, self._axis[:, None], axis=1) < 0
         self._pair = np.where(falls, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
-        self._cells, slot = np.unique(self._pair, return_inverse=True)
-        self._slot = slot.reshape(self._pair.shape)
+        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # ask for those of any of ours
+        self._cells = np.unique(np.append(self._pair, of_others))
+        self._slot = np.searchsorted(self._cells, self._pair)
 
     def faces(
-        self, laws: Laws, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
+        self, laws: Any, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
     ) -> BorderFaces:
         """Return the faces as the cells conduct.
 
@@ -89,14 +87,14 @@ class Borders:
         places, moved
             Of the local cells (c, d), m: places of their pressures from their midpoints, and how they have moved since.
         """
-        grid, d = self._grid, self._grid.dim
+        grid, d = self.grid, self.grid.dim
         ways, slots = flow.mobility.ways, 1
         if ways is not None:
             slots = ways.law.shape[-1]
             plain = replace(flow, mobility=Mobility(np.ones(len(contents.filled))))
             held = contents.slot(np.flatnonzero(self.mixed >= 0))
             ways = ways.eased(plain.along(d)[held])
-        slots = int(over_all(grid.comm, slots, MPI.MAX))
+        slots = grid.comm.allreduce(slots, MPI.MAX)
         own = np.flatnonzero(self._cells < grid.num_owned)
         cells, along = self._cells[own], flow.along(d)
         out = none(len(self._cells), len(laws.scales), slots).everywhere(d)
@@ -125,11 +123,11 @@ class Borders:
         area = area * np.broadcast_to(grid.volumes(first), len(axis)) / across[0]
         two = [out.at(self._slot[0], axis, 1), out.at(self._slot[1], axis, 0)]
         weight = np.zeros(d) if flow.weight is None else flow.weight
-        return BorderFaces(laws, self._pair, area, two, lengths, apart, weight, flow.bulk, grid)
+        return BorderFaces(self, flow.mobility, laws, self._pair, area, two, lengths, apart, weight, flow.bulk)
 
     def through_sides(
         self,
-        laws: Laws,
+        laws: Any,
         mobility: Mobility,
         cells: NDArray[np.int32],
         normal: NDArray[np.float64],
@@ -154,25 +152,28 @@ class Borders:
 
     def _from_others(self, ways: Ways) -> Ways:
         """Return ways of the cells beside these faces, those of ghosts as their owners have them."""
-        if self._grid.comm.size == 1:
+        if self.grid.comm.size == 1:
             return ways
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in ways]
         width = np.cumsum([column.shape[1] for column in columns])
-        rows = np.zeros((self._grid.num_local, width[-1]))
+        rows = np.zeros((self.grid.num_local, width[-1]))
         rows[self._cells] = np.concatenate(columns, axis=1)
-        found = np.split(with_ghosts(self._grid, rows)[self._cells], width[:-1], axis=1)
+        found = np.split(with_ghosts(self.grid.cellwise(), rows)[self._cells], width[:-1], axis=1)
         return Ways(*(part.reshape(of.shape).astype(of.dtype) for part, of in zip(found, ways, strict=True)))
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class BorderFaces:
     """Faces between cells that do not conduct alike, as these conduct.
 
-    laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); ways, lengths, apart: two each, of the cells, see
-    `through`, and vectors (m, d), m; weight (d,): of the fluid, N/m^3; bulk: its bulk modulus, Pa.
+    borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); ways,
+    lengths, apart: two each, of the cells, see `through`, and vectors (m, d), m; weight (d,): of the fluid, N/m^3;
+    bulk: its bulk modulus, Pa.
     """
 
-    laws: Laws
+    borders: Borders
+    mobility: Mobility
+    laws: Any
     pair: NDArray[np.int64]
     area: NDArray[np.float64]
     ways: list[Ways]
@@ -180,60 +181,43 @@ class BorderFaces:
     apart: list[NDArray[np.float64]]
     weight: NDArray[np.float64]
     bulk: float
-    grid: Grid
-    force: NDArray[np.float64] | None = None
-    """Force of inertia on the fluid (c, d), N/m^3, in the local cells, if there is any."""
-    _found_at: NDArray[np.float64] | None = None
 
-    def set_force(self, cells: NDArray[np.int64], force: NDArray[np.float64]) -> None:
-        """Set the force of inertia on the fluid (n, d), N/m^3, in the active owned cells (n,)."""
-        self.force, self._found_at = np.zeros((self.grid.num_local, self.grid.dim)), None
-        self.force[cells] = force
-        self.force = with_ghosts(self.grid, self.force)
-
-    def set_pressures(self, p: NDArray[np.float64]) -> None:
-        """Find the fluxes at pressures of the local cells (c,), Pa."""
-        pair = p[self.pair]
-        if self._found_at is not None and np.array_equal(self._found_at, pair):
-            return
-        self._found_at = pair
-        weight = self.weight if self.force is None else self.weight + self.force[self.pair].mean(axis=0)
+    def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
+        """Return what flows at pressures (2, m) of the cells, Pa; force (c, d): of inertia on the fluid, N/m^3."""
+        weight = (
+            self.weight
+            if force is None
+            else self.weight + with_ghosts(self.borders.grid.cellwise(), force)[self.pair].mean(0)
+        )
         falls = [(way * weight).sum(axis=1) for way in self.apart]
-        found: Through = through(self.laws, pair, self.ways, self.lengths, falls)
-        density = self.area * mean_density(*pair, self.bulk)
-        self._flux = density * found.conductance * (pair[0] - pair[1] + sum(falls))
-        self._slopes = [density * slope for slope in found.slopes]
+        found = through(self.laws, p, self.ways, self.lengths, falls)
+        density = self.area * mean_density(*p, self.bulk)
+        flux = density * found.conductance * (p[0] - p[1] + sum(falls))
+        return BorderFlows(self.pair, flux, [density * slope for slope in found.slopes])
+
+
+@dataclass(frozen=True)
+class BorderFlows:
+    """What flows through such faces: pair (2, m): local cells; flux (m,), m^d/s; slopes by both pressures (m,)."""
+
+    pair: NDArray[np.int64]
+    flux: NDArray[np.float64]
+    slopes: list[NDArray[np.float64]]
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
         """Add the outflows of the local cells (c,), m^d/s."""
         for cells, sign in zip(self.pair, (1, -1), strict=True):
-            np.add.at(out, cells, sign * self._flux)
+            np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
         """Add the slopes of the outflows to a matrix; the caller finalises it."""
-        if not len(self.area):
+        if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]
-        own, other = self._slopes
+        own, other = self.slopes
         values = np.stack([np.stack([own, -other], axis=1), np.stack([-own, other], axis=1)])
         columns = np.broadcast_to(number.T, values.shape)
         starts = np.arange(0, values.size + 1, 2)
-        A.setValuesIJV(
-            starts.astype(PETSc.IntType),
-            columns.ravel().astype(PETSc.IntType),
-            values.ravel(),
-            addv=True,
-            rowmap=number.ravel().astype(PETSc.IntType),
-        )
-
-
-def with_ghosts(grid: Grid, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows (c, k) of the local cells, those of ghosts as their owners have them."""
-    if grid.comm.size == 1:
-        return rows
-    carrier, out = fem.Function(grid.cellwise()), np.empty_like(rows)
-    for i, column in enumerate(rows.T):
-        carrier.x.array[:] = column
-        carrier.x.scatter_forward()
-        out[:, i] = carrier.x.array
-    return out
+        entries = (x.ravel().astype(PETSc.IntType) for x in (starts, columns, number))
+        starts, columns, rows = entries
+        A.setValuesIJV(starts, columns, values.ravel(), addv=True, rowmap=rows)

@@ -179,12 +179,13 @@ class MixedCells:
 
     def _way(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Ways:
         """Return the ways (n, ...) from places (n,) along an axis, in the cell, to one of its ends."""
-        n, sign, lines = len(place), 2 * end - 1, self._lines[axis]
-        middle = sign * (self._x[lines.piece, axis] - place[self._at[lines.line]])
+        n, lines = len(place), self._lines[axis]
+        middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
         length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part beyond the place
         kept = np.flatnonzero(length > SAME)
         kept = kept[np.lexsort((middle[kept], lines.line[kept]))]
-        line, piece, length = lines.line[kept], lines.piece[kept], length[kept]
+        line, piece = lines.line[kept], lines.piece[kept]
+        length = length[kept]
         total = sum_by(line, length, len(kappa))
         weight = np.where(total > 0, self._volume, 0.0)
         weight = weight / np.maximum(sum_by(self._at, weight, n), TINY)[self._at]

@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME, TINY
 from mpm_dolfinx.flow.unsaturated import Laws
+from mpm_dolfinx.pores.retention import FARTHEST
 
-FARTHEST = 2.0
-"""Change of the logarithm of a suction between two soils in a step of Newton's method, at most."""
-MOST = 200  # Source: exact bound
+MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
 
 
 class Ways(NamedTuple):
@@ -163,14 +162,16 @@ class _Chain:
 
     def solved(self) -> NDArray[np.float64]:
         """Return conductances and slopes (3, m)."""
-        links, inner, drives = self._links, slice(1, -1), self._drives[:, None]
+        links, drives = self._links, self._drives[:, None]
+        inner = slice(1, -1)
         scale = np.full(self._rest.shape, np.inf)
         for node in (links.low, links.high):
             np.minimum.at(scale, (links.face, node), self._laws.scales[links.law])
         scale = scale[:, inner]
         low, high = np.sort([self._rest, self._rest - drives], axis=0)[:, :, inner]
         size = np.minimum(scale, np.abs(low) + np.abs(high))
-        done, most, went = self._nodes == 2, np.full(scale.shape, FARTHEST), np.zeros(scale.shape)
+        done = self._nodes == 2
+        most, went = np.full(scale.shape, FARTHEST), np.zeros(scale.shape)
         p = self._rest - np.arange(self._nodes) / (self._nodes - 1) * drives
         p[:, -1] = self._p[1]
         for _ in range(MOST):
@@ -184,7 +185,7 @@ class _Chain:
             there = np.clip(here + step, low, high)
             y, to = np.arcsinh(here / scale), np.arcsinh(there / scale)
             # where it would turn back, no further than half of the way
-            most = np.minimum(np.where(went * (to - y) < 0, np.abs(went) / 2, 1.25 * most), FARTHEST)
+            most = np.where(went * (to - y) < 0, np.abs(went) / 2, np.minimum(1.25 * most, FARTHEST))
             far = (np.abs(to - y) > most) & (np.minimum(y, to) < 0)
             went = np.where(far, np.clip(to - y, -most, most), to - y)
             there = np.where(far, (scale * np.sinh(np.where(far, y + went, 0.0))).clip(low, high), there)
@@ -230,7 +231,8 @@ class _Chain:
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
         """Return conductances and slopes (3, m) between the ends: in series along a way, side by side with others."""
-        out, rows, part = None, np.stack(flows[:3]), 0
+        out, part = None, 0
+        rows = np.stack(flows[:3])
         for count in self._counts:
             way = None
             for i in range(part, part + count):

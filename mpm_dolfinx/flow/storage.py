@@ -49,14 +49,14 @@ from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
-from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts
-from mpm_dolfinx.pores.retention import Retentions, restrained
+from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
 
 FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
@@ -189,14 +189,20 @@ class StorageForms:
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
-    def driven(self, assembled: FacetSum, active: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the outflow that p and the fluid's weight drive from active cells to others, m^d/s, a local array."""
-        if self.fluxes.relative is not None:
-            self.fluxes.relative.set_pressures(self.p.x.array)
+    def driven(
+        self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """Return the outflow that p and the fluid's weight drive from active cells to others, m^d/s, a local array.
+
+        force (c, d): of inertia on the fluid in the local cells, N/m^3, if there is any.
+        """
+        relative, borders = self.fluxes.relative, None
+        if relative is not None:
+            borders = relative.set_pressures(self.p.x.array, force)
         self._work.x.array[active] = 0.0
         assembled.assemble_vector(self._work.x.array)
-        if self.fluxes.relative is not None and self.fluxes.relative.borders is not None:
-            self.fluxes.relative.borders.add_fluxes(self._work.x.array)
+        if borders is not None:
+            borders.add_fluxes(self._work.x.array)
         return sum_ghosts(self._work)
 
 
@@ -268,8 +274,7 @@ class StorageSystem:
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
-        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
-        self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
+        self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
@@ -279,6 +284,16 @@ class StorageSystem:
             pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
             pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
+
+    @property
+    def gravity(self) -> FacetSum | None:
+        """What p and the fluid's weight drive between cells that conduct alike, if there is a weight."""
+        return self._alike(self._forms.fluxes.gravity)
+
+    def _alike(self, form: FacetForm | None) -> FacetSum | None:
+        """Return a form over the faces between cells that conduct alike, see `Relative`."""
+        relative = self._forms.fluxes.relative
+        return form and form.on(self._facets if relative is None else relative.alike(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return where on the grid this process's unknowns are, and none that are held: see `multigrid_solver`."""
@@ -312,10 +327,6 @@ class StorageSystem:
         """Assemble the fluxes through inner faces; off: of `AslantFlow`, where there is any."""
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
-        if fluxes.relative is not None:
-            borders = flow.mobility.borders
-            alike = self._facets if borders is None else borders.alike
-            self._flux, self.gravity = fluxes.flux.on(alike), fluxes.gravity.on(alike)
         if (relative := self._forms.fluxes.relative) is not None:
             p = self._forms.p.x.array[contents.filled]
             mobility = mobility * relative.at(contents.filled, p)[:, None]
@@ -328,15 +339,16 @@ class StorageSystem:
             aslant = AslantFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
 
-    def assemble_fluxes(self) -> None:
-        """Assemble the matrix of the fluxes between cells, where pores drain at p."""
+    def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
+        """Assemble the matrix of the fluxes between cells, where pores drain at p; force: see `StorageForms.driven`."""
         zero(self.T)
-        if (relative := self._forms.fluxes.relative) is not None:
-            relative.set_pressures(self._forms.p.x.array)
-        if self._flux is not None:
-            self._flux.assemble_matrix(self.T)
-        if relative is not None and relative.borders is not None:
-            relative.borders.add_slopes(self.T, self.unknowns)
+        relative, borders = self._forms.fluxes.relative, None
+        if relative is not None:
+            borders = relative.set_pressures(self._forms.p.x.array, force)
+        if (flux := self._alike(self._forms.fluxes.flux)) is not None:
+            flux.assemble_matrix(self.T)
+        if borders is not None:
+            borders.add_slopes(self.T, self.unknowns)
         self.T.assemble()
 
 
@@ -523,9 +535,16 @@ class StorageProblem:
         """Relative accuracy that a linear solve needs: dry cells store next to nothing, and what is left is theirs."""
         return SAME if self.forms.retains else 1.0
 
-    def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures are to fall, Pa, where pores drain and Newton's method asks for falls (n,)."""
-        return restrained(self.forms.p.x.array[self.system.unknowns.owned], dp, self._scale)
+    def restrained(
+        self, dp: NDArray[np.float64], went: NDArray[np.float64] | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
+        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
+
+        Also, where pores drain, by how much the logarithm of their suction changes; went: the same of the step before.
+        """
+        p = self.forms.p.x.array[self.system.unknowns.owned]
+        dp = restrained(p, dp, self._scale, went)
+        return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
         """Open and close what asks for it by the flow at (u, p); return whether that has changed anything.
@@ -592,15 +611,17 @@ class StorageProblem:
 
     def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
-        system, fluid, relative = self.system, self._fluid, self.forms.fluxes.relative
+        system, fluid = self.system, self._fluid
+        force = None
         if self._inertial is not None:
             fluid = fluid._replace(force=self._inertial())
-            if relative is not None and relative.borders is not None:
-                relative.borders.set_force(system.unknowns.owned, fluid.force)
+            force = self._local(fluid.force)
         if system.gravity is None:
             cells = system.between(fluid.pi) + self._aslant
         else:
-            cells = self.forms.driven(system.gravity, self._contents.active)[system.unknowns.owned] + self._aslant
+            cells = (
+                self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned] + self._aslant
+            )
         lost, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):
@@ -608,6 +629,12 @@ class StorageProblem:
             lost, gain = lost + leaving.cells, gain + leaving.gain
             turnover = turnover + leaving.turnover
         return Rates(cells + lost, lost, turnover, gain)
+
+    def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (n, d) of the active owned cells in an array (c, d) of the local ones."""
+        out = np.zeros((self.forms.grid.num_local, values.shape[1]))
+        out[self.system.unknowns.owned] = values
+        return out
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
         """Return the fluid (n,), m^d, that came to the filled owned cells in the step by fluxes and sources.
@@ -637,7 +664,7 @@ class StorageProblem:
             A.assemble()
         if forms.fluxes.relative is not None:
             self._flow(False)
-            system.assemble_fluxes()
+            system.assemble_fluxes(None if self._inertial is None else self._local(self._inertial()))
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:

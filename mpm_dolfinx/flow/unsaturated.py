@@ -10,6 +10,7 @@ conducts as `series` has it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import CENTRAL, EPSILON, SECOND, TINY
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.pores.retention import Conductance, Retentions
@@ -130,8 +132,6 @@ class Relative:
     ----------
     shares
         DG0: shares of soils whose pores stay full, and of each of the laws, in a cell's mobility at k_r = 1.
-    borders
-        Faces between cells that do not conduct alike, as these conduct; None where all do.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -139,16 +139,16 @@ class Relative:
         self.count = len(self._laws.scales)
         self.shares = fem.Function(grid.cellwise((self.count,)))
         self._tables = fem.Function(grid.cellwise((3 * (self.count - 1),)))
-        self._mesh = grid.mesh
-        self.borders = None
-        self._of_sides = None
+        self._grid = grid
+        self._borders: Latest[Any] = Latest()
+        self._flows: Latest[Any] = Latest()
 
     def between(self, pressure: fem.Function, fall) -> list[Between]:
         """Return k_r of each law between the two sides of a face as UFL variables: see `fitted`."""
         out = []
         for i, law in enumerate(self._laws.conductances):
             tables = [[self._tables(side)[3 * i + j] for j in range(3)] for side in "+-"]
-            scale = fem.Constant(self._mesh, law.scale)
+            scale = fem.Constant(self._grid.mesh, law.scale)
             found = fitted([pressure(side) for side in "+-"], tables, fall, scale, UFL)
             out.append(found._replace(k=ufl.variable(found.k)))
         return out
@@ -157,11 +157,22 @@ class Relative:
         """Return by how much less the cell on a side of a face conducts, as UFL of k_r of each law there."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
-    def set_pressures(self, p: NDArray[np.float64]) -> None:
-        """Set what forms see of the pressures of the local cells (c,), Pa."""
+    def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
+        """Set what forms see of the pressures of the local cells (c,), Pa.
+
+        Return what flows through faces between cells that do not conduct alike, see `borders`; None where all do.
+        force (c, d): of inertia on the fluid, N/m^3.
+        """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
-        if self.borders is not None:
-            self.borders.set_pressures(p)
+        if (faces := self._borders.value) is None:
+            return None
+        pair = p[faces.pair]
+        return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
+
+    def alike(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return those of the faces between active cells on whose sides soils conduct alike."""
+        faces = self._borders.value
+        return facets if faces is None else faces.borders.alike
 
     def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return k_r (m,) of owned cells at pressures (m,), Pa."""
@@ -182,15 +193,15 @@ class Relative:
         drives by out of the cells.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, rises, drives = shares[:, 0].copy(), shares[:, 0].copy(), p - outer + fall
+        k, rises = shares[:, 0].copy(), shares[:, 0].copy()
         for law, share in zip(self._laws.conductances, shares.T[1:], strict=True):
             between = fitted((p, outer), (law(p).T, law(outer).T), fall, law.scale, NUMPY)
             k += share * between.k
-            rises += share * (between.k + between.slopes[0] * drives)
-        if self._of_sides is not None:
-            borders, mobility = self._of_sides
-            for rows, *found in borders.through_sides(self._laws, mobility, cells, normal, p, outer, fall):
-                k[rows], rises[rows] = found
+            rises += share * (between.k + between.slopes[0] * (p - outer + fall))
+        if (faces := self._borders.value) is not None:
+            found = faces.borders.through_sides(self._laws, faces.mobility, cells, normal, p, outer, fall)
+            for rows, *of_borders in found:
+                k[rows], rises[rows] = of_borders
         return k, np.maximum(rises, 0.0)
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
@@ -202,5 +213,5 @@ class Relative:
     def set_borders(self, contents, flow, places: NDArray[np.float64], moved: NDArray[np.float64]) -> None:
         """Set the faces between cells that do not conduct alike, by how the cells conduct: see `borders`."""
         borders = flow.mobility.borders
-        self.borders = borders and borders.faces(self._laws, contents, flow, places, moved)
-        self._of_sides = borders and (borders, flow.mobility)
+        make = partial(borders.faces, self._laws, contents, flow, places, moved) if borders else lambda: None
+        self._borders(object(), make)

@@ -127,3 +127,15 @@ def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
     if function.function_space.mesh.comm.size > 1:
         _compat.scatter_reverse_add(function)
     return function.x.array
+
+
+def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows (c, k) of the local dofs of a scalar space, those of ghosts as their owners have them."""
+    if space.mesh.comm.size == 1:
+        return rows
+    carrier, out = fem.Function(space), np.empty_like(rows)
+    for i, column in enumerate(rows.T):
+        carrier.x.array[:] = column
+        carrier.x.scatter_forward()
+        out[:, i] = carrier.x.array
+    return out

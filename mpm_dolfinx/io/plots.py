@@ -61,7 +61,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
         what = f"plot: {error}; must be installed: apt-get install python3-matplotlib, or conda-forge's matplotlib"
         raise ImportError(what) from error
     ax = plt.subplots()[1] if ax is None else ax
-    style = {"edgecolors": "face", "linewidth": 0.25} | style
+    style = {"edgecolors": "face", "linewidth": 0.5} | style
     drawn = ax.add_collection(PolyCollection(corners[:, VTK_CELLS[2][1]], array=values, **style))
     ax.autoscale_view()
     radius = "r" if simulation.grid.axisymmetric else "x"
@@ -69,7 +69,8 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     if bar:
         known = unit(field)
         label = label or field.replace("_", " ") + (f" ({known})" if known else "")
-        ax.figure.colorbar(drawn, cax=ax.inset_axes(bounds=(1.03, 0, 0.04, 1)), label=label)  # as high as the body
+        cax = ax.inset_axes(bounds=(1.03, 0, 0.04, 1))  # as high as the body, which may be flat
+        ax.figure.colorbar(drawn, cax=cax).ax.set_title(label, loc="right", fontsize="medium")
     return ax
 
 

@@ -184,9 +184,8 @@ class Writer:
 def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
     """Return porosity, saturation, components and invariants of stresses (n,) at this process, by name."""
     asked, wet = simulation.point_fields(), simulation.scene.fluid is not None
-    out = {"porosity": asked.porosity}
-    if simulation.scene.materials.retentions is not None:
-        out["saturation"] = asked.saturation
+    drains = simulation.scene.materials.retentions is not None
+    out = {name: getattr(asked, name) for name in ("porosity", "saturation")[: 1 + drains]}
     for name in ("effective_stress", "stress")[: 1 + wet]:
         of = components(getattr(asked, name), simulation.grid.dim)
         out |= {f"{name}_{each}": values for each, values in of.items()}

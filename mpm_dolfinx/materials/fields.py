@@ -434,6 +434,20 @@ class SceneMaterials:
         return out
 
     @property
+    def some_elastic(self) -> bool:
+        """Whether any law has no history."""
+        return any(not law.state for law in self.laws)
+
+    def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return the points (n,) whose law has no history."""
+        return np.array([not m.state for m in self.materials])[points.material]
+
+    def alike(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return rows (n, c) that are equal at points of the same elastic soil, whatever its initial stress."""
+        fields = [points.data[name].reshape(len(points), -1) for name in self.field_names if name != "seeded_stretch"]
+        return np.column_stack([points.material, *fields])
+
+    @property
     def dilates(self) -> bool:
         """Whether the plastic flow of any soil may change its volume; the same on all processes."""
         used = [self.materials[i] for i in self._used]

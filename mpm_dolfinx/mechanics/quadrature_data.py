@@ -3,22 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import cell_ratios
+from mpm_dolfinx.domains.domain_slopes import LinearGradients
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 TOLD = 50
 """Weight of the corner-based volume ratio of a cell at the start of a step, in units of G / (lambda + 2G), at most 1.
@@ -86,8 +88,8 @@ class QuadraturePoints:
     ----------
     grid
         Background grid.
-    scene
-        The materials of the scene.
+    scene, bodies
+        The materials of the scene, and all its bodies.
     fluid
         Pore fluid, if any.
     weighs
@@ -107,8 +109,17 @@ class QuadraturePoints:
         Whether the conductivity differs between points.
     """
 
-    def __init__(self, grid: Grid, scene: SceneMaterials, fluid: Fluid | None, weighs: bool, extended: bool):
+    def __init__(
+        self,
+        grid: Grid,
+        scene: SceneMaterials,
+        bodies: Sequence[Body],
+        fluid: Fluid | None,
+        weighs: bool,
+        extended: bool,
+    ):
         self._grid, self._fluid = grid, fluid
+        self._linear = LinearGradients(grid.comm, bodies) if scene.some_elastic else None
         self._scene = scene
         self._weighs = weighs
         self._extended = extended
@@ -165,6 +176,8 @@ class QuadraturePoints:
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
         """Return the integration points of a cut with all their data, from the present points."""
         changing = {name: cut.to_cells(values) for name, values in self._changing(points).items()}
+        if self._linear is not None and cut.domains:
+            changing |= {name: cut.pieces_to_cells(values) for name, values in self._gradients(cut, points).items()}
         fields = {**self._constant(cut, points), **changing, **self._own(cut, points)}
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
@@ -216,6 +229,14 @@ class QuadraturePoints:
         if self._weighs:
             fields["density"] = self._scene.density(points)
         return fields
+
+    def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return F, and a stretch across the plane if laws see one, at the pieces of this process's points."""
+        of_materials = self._scene.elastic(points), self._scene.alike(points)
+        if not self._scene.across:
+            return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}
+        F = self._linear.at_pieces(cut, in_space(points.F, points.data[ACROSS]), *of_materials)
+        return dict(zip(("F", ACROSS), in_plane(F), strict=True))
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the data that differ between pieces of one point, if user-defined functions may use them."""

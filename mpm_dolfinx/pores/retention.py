@@ -475,13 +475,16 @@ Plateau (dry): halved 7.6e-10, doubled 9.8e-10, cells 6.6e-03.
 
 
 def restrained(
-    p: NDArray[np.float64], dp: NDArray[np.float64], scale: NDArray[np.float64] | float
+    p: NDArray[np.float64],
+    dp: NDArray[np.float64],
+    scale: NDArray[np.float64] | float,
+    went: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
     """Return by how much pressures p (n,) are to fall, Pa, where Newton's method asks for falls dp (n,).
 
     Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for the
     saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  The logarithm of the suction
-    changes by at most `FARTHEST`.
+    changes by at most `FARTHEST`, and where it turns back by half of what it has changed by: else it may go to and fro.
 
     Parameters
     ----------
@@ -489,11 +492,14 @@ def restrained(
         Pressures, and falls that are asked for.
     scale : (n,), Pa
         Suction about which pores drain.
+    went : (n,)
+        By how much their `logarithm` has changed in the step before.
     """
     there, turn = p - dp, -scale
     there = np.where((p - turn) * (there - turn) < 0, turn, there)
     here, y = logarithm(p, scale), logarithm(there, scale)
-    far = (np.abs(y - here) > FARTHEST) & (np.minimum(here, y) < 0)
-    y = here + np.clip(y - here, -FARTHEST, FARTHEST)
+    most = np.where(went * (y - here) < 0, np.minimum(np.abs(went) / 2, FARTHEST), FARTHEST)
+    far = (np.abs(y - here) > most) & (np.minimum(here, y) < 0)
+    y = here + np.clip(y - here, -most, most)
     there = np.where(far, pressure_at(y, scale), there)
     return np.where(there == p - dp, dp, p - there)

@@ -236,6 +236,7 @@ class Newton:
         keep = self._solvers.plan.keep
         count = 0
         slow = False
+        went: NDArray[np.float64] | float = 0.0
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
             if found is not errors:  # converged, but contacts have changed
@@ -250,7 +251,7 @@ class Newton:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
             if self._storage is not None:
-                self._solvers.restrain(self._storage)
+                went = self._solvers.restrain(self._storage, went)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
             # infinite before any fluid has moved

@@ -102,7 +102,8 @@ class OnGrid(Keyed):
         self.stiffness = np.zeros(grid.num_local)
         """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
         np.maximum.at(self.stiffness, cut.cells, rows)
-        self.contents, self._mixed, self._borders = None, None, None
+        self.contents = None
+        self._mixed, self._borders = None, None
         if storage is not None:
             brought = PieceContents(
                 cells=cut.cells,

@@ -107,7 +107,7 @@ class Scene:
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
         inside = [term for term in terms if not isinstance(term, OnSide)]
-        self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(len(inside) + len(sources)))
+        self.pieces = QuadraturePoints(grid, scene, bodies, fluid, weighs, bool(len(inside) + len(sources)))
         laws, p = self.pieces.laws, CellPressure(*(fem.Function(grid.cellwise()) for _ in range(3))) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None

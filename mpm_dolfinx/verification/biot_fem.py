@@ -115,7 +115,7 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton without state, and pore fluid.
+        Skeleton without state, and pore fluid.  Steps of steep retention (n > 2.5, an air entry) may not converge.
     walls
         Sides with the components that are zero there, such as {"left": "xy"}.
     conditions

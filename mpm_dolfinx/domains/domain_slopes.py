@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""Deformation gradients that vary linearly within the particle domains of elastic soil.
+
+The gradient of a domain is a mean.  In bending the gradient varies across the domain.  With one value per domain the
+bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a piece of the domain
+
+    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the volume at rest),
+
+with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of the
+neighbours across faces that have the same material.  e is then corrected so that the pieces have the domain's volume at
+rest, int dV / det F.  Linear fields are reproduced on any mesh, and uniform fields stay uniform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.cutting import FACES, corner_bits
+from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
+
+
+class Neighbours:
+    """Neighbours of domains across shared faces, also on other processes.
+
+    Parameters
+    ----------
+    comm
+        The processes.
+    bodies
+        All bodies of the scene.
+    ids : (n,)
+        Numbers of the material points of this process.
+    chosen : (n,)
+        Which of them have neighbours.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):
+        starts = np.cumsum([0, *map(len, bodies)])
+        self.rows = rows = np.flatnonzero(chosen & (ids < starts[-1]))
+        """The points (k,) with neighbours."""
+        dim = bodies[0].dim
+        of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.int64)
+        for i, body in enumerate(bodies):
+            here = np.flatnonzero(of == i)
+            corners = (2**dim * starts[i] + body.nodes(ids[rows[here]] - starts[i]))[:, FACES[dim]]
+            # equal for both sides of a face: its lowest corner, and the one diagonally opposite
+            first = corners.argmin(axis=2)[:, :, None]
+            ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
+            key[here] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
+        key = key.ravel()
+        partner = _pairs(key)
+        self._lone = np.flatnonzero(partner < 0)
+        self._to_home = Exchange(comm, (key[self._lone] % comm.size).astype(np.int32))
+        self._there = _pairs(self._to_home.send(key[self._lone]))
+        found = self._to_home.back(self._there >= 0)
+        partner[self._lone[found]] = len(key) + np.flatnonzero(found)
+        self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face, -1 without
+
+    def elsewhere(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
+        """Return a function of the face that gives columns and face centres of the neighbours, and whether they exist.
+
+        own (c, k): columns of these points; faces: centres (d, k), m, of each of their faces.
+        """
+        count = own.shape[1]
+        if self._to_home.comm.size > 1:
+            point, face = np.divmod(self._lone, len(faces))
+            rows = np.concatenate([own[:, point], np.stack(faces, axis=2)[:, point, face]])
+            away = self._to_home.back(self._to_home.send(rows.T.copy())[self._there]).T
+            own = np.concatenate([own, away[: len(own)]], axis=1)
+            centres = np.concatenate([np.stack(faces, axis=2).reshape(len(faces[0]), -1), away[len(own) :]], axis=1)
+        else:
+            centres = np.stack(faces, axis=2).reshape(len(faces[0]), -1)
+
+        def of(face: int) -> tuple[NDArray, NDArray, NDArray]:
+            at = self._partner[face]
+            point = np.where(at < count * len(faces), at // len(faces), at - count * (len(faces) - 1))
+            return own[:, point], centres[:, at], at >= 0
+
+        return of
+
+
+class LinearGradients:
+    """Deformation gradients at the pieces of a scene.
+
+    Parameters
+    ----------
+    comm
+        The processes.
+    bodies
+        All bodies of the scene.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
+        self._comm, self._bodies = comm, bodies
+        self._neighbours: Latest[Neighbours] = Latest()
+
+    def at_pieces(
+        self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], alike: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return `within` for elastic points (n,) of a cut; on all processes together."""
+        key = cut.points.id, elastic
+        return within(
+            self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, alike
+        )
+
+
+def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index (n,) of the other entry with the same key, -1 without."""
+    order, out = np.argsort(key, kind="stable"), np.full(len(key), -1)
+    same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
+    out[order[same]], out[order[same + 1]] = order[same + 1], order[same]
+    return out
+
+
+def within(
+    neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], alike: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return deformation gradients (m, k, k) at the pieces of this process's points.
+
+    Parameters
+    ----------
+    neighbours
+        Neighbours of the domains in which F varies.
+    cut
+        Cut particle domains.
+    F : (n, k, k)
+        Deformation gradients of the points.
+    alike : (n, c)
+        Equal rows mark points of the same material.
+    """
+    # arrays have points or pieces last: rows of a few numbers each would take numpy several times as long
+    of, fraction = cut.pieces.point, cut.pieces.fraction
+    d, k = cut.grid.dim, F.shape[1]
+    slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
+    slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, alike)
+    apart = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
+    xi = [sum(inverse[a, b][of] * x for b, x in enumerate(apart)) for a in range(d)]
+    J, back = determinant(F), np.moveaxis(cofactor(F), 0, 2).swapaxes(0, 1)
+    e = np.einsum("ijn,ajkn->aikn", back / J, slope)
+    ratio = np.trace(e, axis1=1, axis2=2)
+    # about the mean by volumes at rest; and without the part of second order, which would change the domain's volume
+    shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
+    for a, b in np.ndindex(d, d):
+        spread = sum_by(of, fraction * xi[a] * xi[b], len(F))
+        shift += spread * ratio[b] * slope[a]
+        second += 0.5 * spread * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
+    base = np.moveaxis(F, 0, 2)
+    base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
+    out = base[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
+    out = np.ascontiguousarray(np.moveaxis(out, 2, 0))
+    here = determinant(out)
+    if (inverted := here <= 0).any():  # their domains keep one gradient
+        even = np.isin(of, of[inverted])
+        out[even] = F[of[even]]
+        here[even] = J[of[even]]
+    return out * (J * sum_by(of, fraction / here, len(F)))[of, None, None] ** (1 / k)
+
+
+def _slopes(
+    neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], alike: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return slopes (d, k, k, r) of F by the coordinates xi of domains, and their inverse edges (d, d, r), 1/m."""
+    rows = neighbours.rows
+    d, k = cut.grid.dim, F.shape[1]
+    corners, bits = np.moveaxis(cut.points.corners[rows], 0, 2).copy(), corner_bits(d)
+    faces = [corners[bits[:, a] == end].mean(axis=0) for a in range(d) for end in (0, 1)]
+    edges = np.stack([faces[2 * a + 1] - faces[2 * a] for a in range(d)], axis=1)
+    inverse = _inverse(edges)
+    own = np.concatenate([F.reshape(len(F), -1)[rows].T, corners.mean(axis=0), alike[rows].T])
+    others = neighbours.elsewhere(own, faces)
+    nearest = NEAR * np.abs(edges).sum(axis=0).min(axis=0)
+    A, B = np.zeros((d, d, len(rows))), np.zeros((d, k * k, len(rows)))
+    for axis in range(d):
+        some = np.zeros(len(rows), dtype=bool)
+        for face in (2 * axis, 2 * axis + 1):
+            there, at_face, known = others(face)
+            joined = known & (np.abs(at_face - faces[face]) <= nearest).all(axis=0)
+            joined &= (there[k * k + d :] == own[k * k + d :]).all(axis=0)
+            xi = np.einsum("abn,bn->an", inverse, there[k * k : k * k + d] - own[k * k : k * k + d])
+            xi[:, ~joined] = 0.0
+            change = there[: k * k] - own[: k * k]
+            for a in range(d):
+                B[a] += xi[a] * change
+                A[a] += xi[a] * xi
+            some |= joined
+        A[axis, axis, ~some] += 1.0  # no neighbour tells this slope
+    return np.einsum("abn,bmn->amn", _inverse(A), B).reshape(d, k, k, len(rows)), inverse
+
+
+def _inverse(A: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverses of matrices (d, d, n)."""
+    A = np.moveaxis(A, 2, 0)
+    return np.moveaxis(cofactor(A).transpose(0, 2, 1) / determinant(A)[:, None, None], 0, 2).copy()
