@@ -199,7 +199,7 @@ class ModifiedCamClay(Skeleton):
 
 
 LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference": "> 0 Pa and finite"}
-"""Constants of the loading-collapse curve, and what they may be."""
+"""Constants of the loading-collapse curve, and their ranges."""
 
 
 def _dried(function: Callable) -> Callable:
@@ -240,8 +240,8 @@ class BarcelonaBasic(ModifiedCamClay):
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
     the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  So soil of a constant
-    suction is Modified Cam Clay with lambda(s), and saturated soil with lambda(0).  Strength by suction, and what soil
-    swells by as it gets wet, are those of Bishop's stress.  The suction is that of the end of a substep.  Where P_c0
+    suction is Modified Cam Clay with lambda(s), and saturated soil with lambda(0).  Strength by suction, and swelling
+    on wetting, follow from Bishop's stress.  The suction is that of the end of a substep.  Where P_c0
     has fallen to P_r, suction changes nothing.
 
     Parameters
@@ -291,7 +291,7 @@ class BarcelonaBasic(ModifiedCamClay):
 
     @staticmethod
     def trial(F, prestretch, plastic, suction):
-        """Return what the trial of Modified Cam Clay is, and the suction."""
+        """Return the trial values of Modified Cam Clay, and the suction."""
         return {**ModifiedCamClay.trial(F, prestretch, plastic), "suction": suction}
 
     residual = staticmethod(_dried(ModifiedCamClay.residual))
