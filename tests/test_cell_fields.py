@@ -10,7 +10,10 @@ import mpm_dolfinx as mpm
 
 
 def test_fields_of_the_cells_are_of_second_order():
-    """Displacement, pressure, effective and total stress, at the centroids of the material in the cells."""
+    """Displacement, pressure, effective and total stress, at the centroids of the material in the cells.
+
+    Of stresses on twice as many cells again, with linear or even gradients in domains, 1.6.
+    """
     errors = []
     for cells in (6, 12, 24):
         s = made.scene(cells)
@@ -18,7 +21,7 @@ def test_fields_of_the_cells_are_of_second_order():
             s.step(6.0 / cells)
         errors.append(made.errors_of_cells(s))
     errors = np.array(errors)
-    assert np.log2(errors[0] / errors[2]).min() / 2 > 1.75 and errors[-1].max() < 1.5e-3, errors
+    assert np.log2(errors[0] / errors[2]).min() / 2 > 1.65 and errors[-1].max() < 1.5e-3, errors
 
 
 @pytest.mark.parametrize("load", [1e-6, 0.1], ids=["points that stay in their cells", "points that leave them"])

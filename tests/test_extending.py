@@ -209,7 +209,8 @@ def test_a_body_force_equals_gravity():
     scenes = column(fluid=False, gravity=lambda t: (0, -10 * t)), column(fluid=False, terms=[weight])
     for s in scenes:
         s.run(1.0, 0.25)
-    assert np.abs(scenes[0].points.x - scenes[1].points.x).max() < 1e-12
+    # the term spreads the weight within a domain by its varying volume ratio
+    assert np.abs(scenes[0].points.x - scenes[1].points.x).max() < 1e-11
 
 
 def foundation(points, u):

@@ -82,11 +82,9 @@ def test_time_steps_of_any_size_give_the_layers_consolidation(dt):
 
 
 @pytest.mark.parametrize("k", ["1e-12", "1e-01"])
-@pytest.mark.parametrize(
-    ("steep", "ends"), [("1e-03", {"converged"}), ("1e+01", {"converged"}), ("1e+03", {"refused"})]
-)
-def test_rain_on_soil_of_any_retention_is_exact_or_refused(k, steep, ends):
-    assert case("rain", f"k = {k} m/s, alpha h = {steep}").outcome in ends
+@pytest.mark.parametrize("steep", ["1e-03", "1e+01", "1e+03"])
+def test_rain_on_soil_of_any_retention_is_exact(k, steep):
+    assert case("rain", f"k = {k} m/s, alpha h = {steep}").outcome == "converged"
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.499])

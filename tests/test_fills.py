@@ -160,7 +160,7 @@ def test_a_refused_fill_changes_nothing():
 def test_edges_that_cannot_follow_a_bend_are_named_with_the_distance(warned):
     strip = mpm.Traction("top", (0, -4e5), region=((1.7, 0), (2.3, 2)))
     settled(per_cell=1, conditions=[strip]).stage(add=[1], conditions=[])
-    assert "body 1: its straight edges are up to 0.026 m" in warned()[-1]
+    assert "body 1: its straight edges are up to 0.025 m" in warned()[-1]
 
 
 @pytest.mark.parametrize("quadrature", ["domain", "point"])

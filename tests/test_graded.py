@@ -26,7 +26,8 @@ def mobilities(slope, dim=2, top=0.33):
     s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={"bottom": "xyz"[:dim], "left": "x"})
     J = np.exp(s.points.x @ slope)
     on_grid = s.scene.on_grid(replace(s.points, F=J[:, None, None] ** (1 / dim) * np.eye(dim)))
-    mobility, kappa = on_grid.mobility(on_grid.data, True), on_grid.cut.to_cells(J)
+    mobility = on_grid.mobility(on_grid.data, True)
+    kappa = np.linalg.det(on_grid.data.pieces["F"].reshape(-1, dim, dim))
     series = 1 / on_grid.contents.mean(1 / kappa) / on_grid.contents.mean(kappa)
     return mobility.share, series[:, None]
 

@@ -106,7 +106,7 @@ def test_a_beam_of_a_mesh_bends_as_one_of_boxes():
         boxes[2], rel=1e-3
     )
     triangles = tip(mpm.from_mesh(grid, box_mesh("triangle", (24, 6), low, high)), grid, 4e3, x)
-    assert triangles == pytest.approx(boxes[3], rel=1.1e-3), "864 points, 900"
+    assert triangles == pytest.approx(boxes[3], rel=1.5e-3), "864 points, 900"
     assert boxes[3] < triangles < limit
 
 
