@@ -291,7 +291,8 @@ def test_soil_under_its_weight_is_at_rest_with_its_suction():
 def test_it_shows_the_same_in_any_frame():
     """In other units, mirrored, carried, cut at a checkpoint, beside a far body, in another order."""
     law = {"M": 1.1, "lambda_": 0.08, "kappa": 0.015, "shear": 2e6, "initial_stress": (-6e4,) * 3, "porosity": 0.4}
-    law |= {"r": 0.4, "beta": 4e-5, "reference": 3e3, "entry": 2e4, "conductivity": 1e-7}
+    law |= {"r": 0.4, "beta": 4e-5, "reference": 3e3, "conductivity": 1e-7}
+    law |= {"retention": ("VanGenuchten", {"entry": 2e4, "n": 1.8})}
     soils = ("BarcelonaBasic", law), ("BarcelonaBasic", law | {"OCR": 1.4})
     ground = Block((0.0, 0.0), (2.0, 1.6), 0), Block((0.0, 1.6), (2.0, 2.2), 1)
     strip = Condition("pressure", "top", (4e4,), 1e4, region=((-9.0, -9.0), (0.9, 9.0)))

@@ -158,8 +158,6 @@ class _Builder:
                 given[name] *= frame.stress
         if "beta" in given:
             given["beta"] /= frame.stress
-        if "entry" in given:
-            given["retention"] = mpm.VanGenuchten(given.pop("entry") * frame.stress, n=1.8)
         if "initial_stress" in given:
             given["initial_stress"] = tuple(frame.stress * s for s in given["initial_stress"])
         if "slip" in given:
