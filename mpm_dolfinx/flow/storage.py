@@ -177,7 +177,7 @@ class StorageForms:
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
         """Return the derivatives of `change` by the pressure (filled cells,), m^d/Pa, and by nodal displacements.
 
-        The latter (filled cells, n), m^(d-1), are those of alpha dJ_Delta, for the momentum, then those of the content
+        The latter (filled cells, n), m^(d-1), are derivatives of alpha dJ_Delta, for the momentum, then of the content
         if they differ.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the forces of stresses gain by the cells' pressures where laws depend on suction.
+"""Derivatives of nodal forces by the cells' pressures, for laws with suction.
 
-A law that sees the suction gives other stresses at other pressures, beside the share of these that Bishop's stress
-has.  With the mean dilatation of cells this changes their mean stress pi as well.
+The stress of such a law depends on p in addition to Bishop's term chi p.  With the mean dilatation of cells their mean
+stress pi depends on p as well.
 """
 
 from __future__ import annotations
