@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Derivatives of nodal forces by the cells' pressures, for laws with suction.
+"""Derivatives of nodal forces by the cells' pressures, through laws that depend on suction.
 
-The stress of such a law depends on p in addition to Bishop's term chi p.  With the mean dilatation of cells their mean
-stress pi depends on p as well.
+The stress of such a law depends on the pressure in addition to the term chi p of Bishop's stress.  So does the mean
+stress pi of cells with mean dilatation.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class OfSuction:
         F
             Deformation gradient (d, d), a UFL variable.
         slopes
-            Derivatives by the pressure of the first Piola-Kirchhoff stress (d, d), and with mean dilatation of its
-            slope by theta, as UFL; none of a law without suction.
+            UFL derivatives by the pressure.  The first is that of the first Piola-Kirchhoff stress (d, d).  With mean
+            dilatation, the second is that of its slope by theta.  Empty without suction.
         """
         share = 1 / ufl.det(points.F)
         tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
