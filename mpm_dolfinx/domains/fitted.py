@@ -28,8 +28,7 @@ def fitted_at(
 ) -> NDArray[np.float64]:
     """Return tensors (m, k, k) at positions in particle domains; collective over the processes.
 
-    The fit uses points of the same body and material, weighted by their distance at rest.  Values in domains that no
-    longer exist are arbitrary.
+    The fit uses points of the same body and material, weighted by distance at rest.  Removed domains get any value.
 
     Parameters
     ----------

@@ -30,10 +30,7 @@ SMALL = (0.5 / EDGES) ** 2
 Source: definition, half of an edge wide.
 """
 COVERED = 0.25
-"""Largest difference between the area of the pieces in a cell and the area bounded by the surface, in cells.
-
-Source: definition, one domain.
-"""
+"""Largest error of the pieces' area against that bounded by the surface, in cells.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Face of a domain for each edge of the ring."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -278,8 +275,7 @@ class RefilledCells:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return keys (m,) of edges in cells (m,), and reference positions (m, 2, 2), m, of their ends.
 
-        The key is that of the surface part nearest to the middle of the edge.  Positions follow from the parts nearest
-        to the ends.
+        The key is that of the surface part nearest to the middle of an edge; for the ends the nearest parts count.
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")

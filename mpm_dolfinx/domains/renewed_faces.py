@@ -16,10 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of point data for each face.
-
-They are the key of the seeded face, -1 for none; the seeded area, m; the reference positions of the ends, m.
-"""
+"""Names of point data for each face: key of the seeded face, -1 for none; seeded area, m; reference ends, m."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -167,8 +167,7 @@ class BorderFaces:
     """Faces between cells of different soil, with their conductivities.
 
     borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); ways,
-    lengths, apart: two each, for the two cells, see `through`, and vectors (m, d), m; weight (d,): of the fluid, N/m^3;
-    bulk: its bulk modulus, Pa.
+    lengths, apart: of both cells, see `through`, and vectors (m, d), m; weight (d,), N/m^3, bulk, Pa: of the fluid.
     """
 
     borders: Borders

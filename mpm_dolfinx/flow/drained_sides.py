@@ -188,8 +188,7 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction: no flow, and a fraction of the two-point flux, in [-1, 1].
 
-        Conductivities change by decades in a step, so the correction must follow the flux.  The limit prevents it from
-        emptying soil.
+        Conductivities change by decades in a step, so the correction follows the flux; it is limited not to empty soil.
         """
         drives = fluid.pi[self.at] - self.outer
         share = np.divide(beyond, drives, out=np.zeros_like(beyond), where=drives != 0).clip(-1, 1)
@@ -212,8 +211,7 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at the bounds.
 
-    The outflow is minus the rain, limited by the outflows at the two bounds.  This includes seepage, so faces with rain
-    have `seeps` false.
+    The outflow is minus the rain, limited by the outflows at the bounds.  It includes seepage, so `seeps` is false.
     """
 
     rain: NDArray[np.float64]

@@ -135,7 +135,7 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes, and shifts in cells, of mixed cells (n, d), from those of their pieces.
+        """Return mobilities along the axes, and shifts in cells, of mixed cells (n, d); kappa: of their pieces.
 
         mean: 1 for shifts to the position of mean pressure, 0 for shifts by inclination alone.
         """

@@ -10,7 +10,7 @@ with h.  With the gradients g of the pressure less the weight of the fluid in th
 and through an open side p - p_out + g . t, with t along the side from the foot of the centroid.  The gradients are a
 least-squares fit to the neighbours, to the pressures of drained sides, and to zero flow across no-flow sides.  The area
 of the latter closes the surface of the material in the cell.  Linear pressures are exact.  The gradients are limited:
-corrected pressures at faces stay between those of the neighbours.
+corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations

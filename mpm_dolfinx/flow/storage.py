@@ -210,9 +210,8 @@ class StorageForms:
 class Outflow:
     """Conductances of the active owned cells at present displacements.
 
-    at: data of each of the feeds, see `Feeds.conducting`; total (n,): outflow per unit of the cell's potential through
-    all faces to other cells, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).  aslant: non-orthogonal
-    correction, or None.
+    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow per unit of the cell's potential to other cells,
+    m^d/(Pa s); mobility (n, d): along the axes, m^2/(Pa s); aslant: non-orthogonal correction, or None.
     """
 
     at: Sequence[Any]
@@ -644,7 +643,7 @@ class StorageProblem:
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble C = d/dp and B = d/du of the residual at (u, p); data: pieces other than those of the substep.
+        """Assemble C = d/dp and B = d/du of the residual at (u, p); data: other pieces than in the residual.
 
         of_suction: cells (c,), and derivatives of their nodal forces (c, n) by p through suction in laws, m^(d-1).
         """

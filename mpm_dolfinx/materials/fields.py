@@ -297,8 +297,7 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
 
-        `value` may return one value (...) for a uniform material without columns; otherwise one value a point, or a
-        single number.
+        `value` returns one value a point or a single number; for a uniform material without columns also one (...).
         """
         each = []
         for i in self._used:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Materials: constitutive laws of the skeleton in UFL, and constants of skeleton and pore fluid.
 
-The material point method and the finite element reference share them.  A user-defined law is a frozen dataclass derived
-from `Skeleton`.
+Both the material point method and the finite element reference use them.  User-defined laws derive from `Skeleton`.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 
 In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
 smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because the nodes are kept separate.
-Principal values that depend on all three eigenvalues, with kinks, are computed in numpy with exact derivatives, see
-`Coaxial`.
+Principal values that depend on all three eigenvalues, with kinks, have exact derivatives in numpy, see `Coaxial`.
 """
 
 from __future__ import annotations
@@ -115,7 +114,7 @@ class Coaxial:
     y : (n, 3)
         Principal values of the coaxial tensors.
     plane
-        Whether tensors are those of plane strain or axisymmetry.
+        Whether tensors have the components `PLANE`, for plane strain and axisymmetry.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
