@@ -39,7 +39,7 @@ class PiecePressures:
     id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) of the domain;
     x : (m, d), m, present position of the centroid.  For pieces that go to the next grid, else None:
     pressure : (m,), Pa, at the centroid; slope : (m, d) of it, Pa/m; bounds : (m, 2), Pa, smallest and largest pressure
-    allowed in the piece.  For pieces that stay here, else None: of_cell, start : (m,), Pa, of the cell now and at the reset.
+    allowed in the piece.  For pieces that stay, else None: of_cell, start : (m,), Pa, of the cell now and at the reset.
     """
 
     id: NDArray[np.int64]
