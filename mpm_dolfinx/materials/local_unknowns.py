@@ -113,7 +113,7 @@ class LocalUnknowns:
         Raises
         ------
         NotConverged
-            Naming the first point where the equations could not be solved.
+            No solution; the message names the first such point.
         """
         trial = self._trial.evaluate(data)
         self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
