@@ -8,8 +8,8 @@ on the reference configuration of a box, from state n:
     storage    int rho [zeta(J, p) - zeta_n] q dV
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
-with tractions t (dead loads or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), and rho = exp((p +
-p_n)/(2 K_w)).  `fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil kappa is
+with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), rho = exp((p + p_n)/(2 K_w)).
+`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil kappa is
 multiplied by k_r.  The content changes by S(p) times its change at saturation, plus the change of S, see `retention`;
 saturated pores have chi = S = k_r = 1.  With pressures constant in the cells the two-point flux is kappa J |F^-T N|^2
 (p+ - p-)/h, for a distance h of the cells' centres.  It is not consistent under shear.  k_r is then its mean over the
