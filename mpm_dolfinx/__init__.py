@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
-A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
+A `Simulation` contains a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), and materials: `Hencky`,
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`,
-`BarcelonaBasic`, or your own `Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`,
-`Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`,
-`Cone`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer`, whose files `one_file` joins, and
-a `Checkpoint`, from which `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens
-it until it slides.  Terms and sources in UFL: see `mpm_dolfinx.materials.user_functions`.
+`BarcelonaBasic`, or a user-defined `Skeleton`.  It has a `Fluid`, and conditions on the sides of the bodies:
+`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`.  A rigid `Tool` has the shape
+`HalfSpace`, `Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  It feeds a `Writer`, whose
+files `one_file` joins, and a `Checkpoint` for `resume`.  `stage` changes the scene between two runs, and
+`factor_of_safety` weakens it until it slides.  Terms in UFL: see `mpm_dolfinx.materials.user_functions`.
 
-SI units throughout, or any that are consistent (`Fluid`).  Stress is positive in tension, pore pressure in compression;
-2D is plane strain, and forces are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
+Units are SI, or any consistent ones (`Fluid`).  Stress is positive in tension, pore pressure in compression.  2D is
+plane strain, with forces of a slice of 1 m, or axisymmetric (`Grid`), with forces of the whole revolution.
 """
 
-from mpm_dolfinx.base import _environment  # noqa: F401 - first: it says what is missing
+from mpm_dolfinx.base import _environment  # noqa: F401 - first: it reports missing dependencies
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.bodies.bodies import Body, mapped
 from mpm_dolfinx.bodies.boxes import box, shape

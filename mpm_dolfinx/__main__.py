@@ -25,7 +25,7 @@ SOLVERS = ("mumps", "superlu_dist", "superlu", "suitesparse", "strumpack", "mkl_
 
 
 def info() -> dict[str, str]:
-    """Return the versions of what the package rests on, and the solvers that PETSc was built with."""
+    """Return the versions of the package's dependencies, and the solvers of PETSc."""
     real = np.issubdtype(PETSc.ScalarType, np.floating)
     return {
         "mpm_dolfinx": mpm_dolfinx.__version__,
@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants that texts name=value say, each of which the law has, once."""
+    """Return the constants of a law from texts name=value; each must be known, and given once."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")

@@ -247,9 +247,9 @@ def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
         ({"initial_stress": lambda x: x}, "must be three normal stresses or a symmetric tensor"),
         ({"gravity": (1.0, -9.81)}, r"K0 with gravity = \[1.0, -9.81\], must be down"),
         ({"pressure": lambda x: np.nan}, r"pressure\(x\) = nan, must be a finite number, or one for each"),
-        ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "must be what MohrCoulomb can bear"),
-        ({"law": "mohr-coulomb", "level": 6.0}, "of open water above it K0 takes the weight as surcharge"),
-        ({"law": "cam clay", "initial_stress": lambda x: np.tile([0, 1e4, 0], (len(x), 1))}, "of compressive mean"),
+        ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "must be inside the yield surface of MohrCoulomb"),
+        ({"law": "mohr-coulomb", "level": 6.0}, "K0 needs the weight of open water as surcharge"),
+        ({"law": "cam clay", "initial_stress": lambda x: np.tile([0, 1e4, 0], (len(x), 1))}, "a compressive mean"),
     ],
 )
 def test_what_is_no_initial_state_is_refused(options, said):

@@ -183,7 +183,7 @@ def test_a_law_in_numpy_has_the_stress_the_tangent_and_the_state_that_it_gives(d
     [
         (lambda trial: {"p": (trial["volume"], {})}, r"Wrong.solution: gives p, must give pressure"),
         (lambda trial: {"pressure": (trial["volume"], {"volume": np.eye(2)})}, r"derivative of pressure by volume has"),
-        (lambda trial: trial["volume"], "what it gives = .* must be a dict"),
+        (lambda trial: trial["volume"], "its result = .* must be a dict"),
         (lambda trial: trial["strain"], "raises KeyError: 'strain'"),
         (lambda trial: {"pressure": trial["volume"]}, "solution: pressure = .* must be a pair"),
         (lambda trial: {"pressure": 3.0}, "solution: pressure = 3.0, must be a pair"),

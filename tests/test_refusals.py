@@ -138,7 +138,7 @@ CASES = {
     "state in words": (lambda: scene(materials=[law(energy=ENERGY, state={"k": "a"})]), "Law: state 'k'", "'a'"),
     "state that is no dictionary": (
         lambda: run_law(update=lambda F, k: k, state={"k": 0.0}),
-        "Law.update: what it gives",
+        "Law.update: its result",
         "must be a dict",
     ),
     "dilation above friction somewhere": (

@@ -292,7 +292,7 @@ class Acting:
 
     conditions: ClassVar[tuple[type, ...]] = ()
     """Condition classes of this kind."""
-    title: ClassVar[str] = "conditions of the user's own"
+    title: ClassVar[str] = "user-defined conditions"
     """Name in the summary of a scene."""
     symmetric: bool = True
     """Whether the tangent is symmetric."""

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The points' domains as they move: cut by the grid, their gradients, and the pressures that they carry."""
+"""Moving particle domains: their cut by the grid, their deformation gradients and their pore pressures."""

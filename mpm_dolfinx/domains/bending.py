@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""The displacement that corners of domains follow: the Q1 field of the grid, without its kinks.
+"""Displacement of the corners of particle domains: the Q1 field of the grid with a quadratic correction.
 
-In bending the true strain varies linearly over a cell, that of a Q1 field does not: it jumps at the grid lines.
-Domains that followed it would take along a sawtooth, and on the way back, with other grid lines across the body, leave
-it as stress.  So corners follow the field with its second differences along each axis,
+In bending the true strain varies linearly over a cell, but the strain of a Q1 field jumps at the grid lines.  Particle
+domains that follow the Q1 field take on a sawtooth strain.  On the way back other grid lines cross the body, and the
+sawtooth remains as stress.  The corners therefore follow the field with its second differences along each axis,
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
-t_a in [0, 1] the place in the cell: exact for quadratic fields, Q1 at the nodes, and continuous.  D_a is the second
-difference along the edge of the cell that node i ends, of cells of many sizes edge^2 times the divided one: the
-smaller one of those at its two ends, zero where their signs differ, and that of one end where the other has none.  So a
-kink that is no error of the grid, as between materials, stays one.
+with the position t_a in [0, 1] in the cell.  This field is exact for quadratic displacements, equal to Q1 at the nodes,
+and continuous.  D_a is a second difference along the cell edge that ends at node i.  Each end of the edge has one; the
+smaller one counts, or zero if their signs differ.  If only one end has a second difference, this one counts.  With
+cells of several sizes D_a is edge^2 times the divided difference.  Physical kinks, as between materials, are kept.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from mpm_dolfinx.points.cutting import corner_bits
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the Q1 field at corners, and what they follow besides (2, m, d), m.
+    """Return the Q1 displacement of corners and its quadratic correction (2, m, d), m.
 
     Parameters
     ----------
     cells, x : (m,), (m, d), m
-        Owned cells that the corners lie in, and their positions.
+        Owned cells with the corners, and positions of the corners.
     u : (nodes, d), m
         Nodal displacements.
     filled : (cells,)
-        Which local cells hold something: beyond an empty one may be nodes of another body.
+        Which local cells contain material.  Nodes beyond an empty cell may belong to another body.
     """
     used = np.flatnonzero(np.bincount(cells, minlength=1))
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
@@ -42,7 +42,7 @@ def followed(
     field = grid.over_edges(grid.monomials @ _at(u, grid.cell_nodes[used]), used)
     bends = _second_differences(grid, used, u, filled)
     out = np.empty((2, *x.shape))
-    # with the corners last: rows of a few numbers each would take numpy six times as long
+    # corners are the last axis: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
         here, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
         out[0, part] = _polynomial(field, y, here).T
@@ -53,17 +53,16 @@ def followed(
 
 
 def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return a vector's nodal values (nodes, d) at nodes (n, k), as (d, k, n)."""
+    """Return nodal values (nodes, d) at nodes (n, k), as (d, k, n)."""
     return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
 
 
 def _polynomial(
     coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
 ) -> NDArray[np.float64]:
-    """Return a vector (d, m) that is multilinear in cells, at offsets y (d, m), m, from their midpoints.
+    """Return a multilinear vector field (d, m) at offsets y (d, m), m, from the midpoints of cells.
 
-    coefficients (d, k, cells): of the monomials as `Grid.monomials` has them; those that do not depend on the axis
-    `without`.
+    coefficients (d, k, cells): of the monomials in the order of `Grid.monomials`, without monomials of axis `without`.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -79,14 +78,14 @@ def _polynomial(
 def _second_differences(
     grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
-    """Return the second differences along the edges of owned cells, m, as polynomials of the places across, per axis.
+    """Return the second differences along the edges of owned cells, m, for each axis.
 
-    That is coefficients (d, 2^(d-1), cells), as `_polynomial` takes them.
+    They are polynomials of the other coordinates: coefficients (d, 2^(d-1), cells) for `_polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
     out = []
-    order = np.lexsort(grid.signs.T)  # of the nodes, as `bits` has them
+    order = np.lexsort(grid.signs.T)  # of the nodes, to match `bits`
     nodes, beside = grid.cell_nodes[cells], grid.beside(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
@@ -106,9 +105,9 @@ def _second_differences(
         first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
         bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
-        across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # one and the same at both ends
+        across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # equal at both ends
         bend = (across[:, low] + across[:, high]) @ bend
-        if not grid.even:  # for offsets in m, as of the field
+        if not grid.even:  # for offsets in m
             rows = np.flatnonzero(np.arange(2**d) >> a & 1 == 0)
             whole = np.zeros((d, 2**d, len(cells)))
             whole[:, rows] = bend

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the points lie on the grid of a step: their pieces, who owns the cells, values there and back."""
+"""Particle domains cut by the grid of a step: their pieces, owners of the cells, transfer of values."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STAYS = 3e-4
-"""Cells by which corners may have moved since the domains were cut before they are cut anew.
+"""Largest motion of corners, in cells, since the domains were cut; beyond it they are cut again.
 
-A column of ten cells that consolidates then differs by 7e-5 of the load in its pressures and by 3e-5 of the
-settlement from one that is cut in every step; both are proportional to this number.
+The reference is a cut in every step.  In a consolidating column of ten cells the pressures change by 7e-5 of the load,
+and the settlement by 3e-5 of itself.  Both errors are proportional to this number.
 """
 
 
 class Patches:
-    """Points of integration on faces of the domains; arrays over n points.
+    """Quadrature points on faces of particle domains; arrays over n of them.
 
     Parameters
     ----------
     grid
         Background grid.
     faces
-        The faces; and of each point:
+        Faces of the surface.
     here, at : (n,)
-        its face among these, and the material point;
+        Index of the face among these, and of the material point.
     cell : (n,)
-        lexicographic cell;
+        Lexicographic cell.
     x, xi : (n, d), m, -
-        position when the domains were cut, and in the domain;
+        Position at the last cut, and coordinates in the domain.
     share : (n,)
-        of the face.
+        Fraction of the face.
     """
 
     def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
@@ -63,7 +63,7 @@ class Patches:
             area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
         self._share0 = share * area0
         self.base = grid.base
-        """From which places count, see `Grid`."""
+        """Origin of positions, see `Grid`."""
         around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
@@ -75,11 +75,11 @@ class Patches:
         return X if self._renewed is None else self._renewed.reference(X, self._xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the positions (n, d), m, from which displacements count."""
+        """Return the positions (n, d), m, at zero displacement."""
         return interpolate(points.origin[self.at], self._xi)
 
     def now(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return where the points of integration have moved to (n, d), m."""
+        """Return the present positions (n, d), m."""
         return interpolate(points.corners[self.at], self._xi)
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -91,9 +91,9 @@ class Patches:
 
 
 class CutDomains(Keyed):
-    """The points' domains cut by the cells, and the way of their data to the owners of the cells.
+    """Particle domains cut by the cells, and the exchange of their data with the owners of the cells.
 
-    It serves until the points have moved: where they were when they were cut is what the grid sees.
+    The cut is valid until the points have moved.  The grid sees the positions at the time of the cut.
 
     Parameters
     ----------
@@ -102,9 +102,9 @@ class CutDomains(Keyed):
     points
         The material points of this process, in the grid.
     domains
-        Exact pieces of the points' domains; else one piece a point, as in standard MPM.
+        Whether to use exact pieces of the particle domains; otherwise one piece a point, as in standard MPM.
     second
-        Whether second moments of the pieces are asked for.
+        Whether to compute second moments of the pieces.
     """
 
     def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False):
@@ -117,25 +117,25 @@ class CutDomains(Keyed):
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
-        """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
+        """Owned cells, and centroids (m, d), m, of the pieces in them."""
         self.mixed = self._travel.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """Their mean products of offsets in 3D, see `Pieces`."""
         self.second = self._travel.send(self.pieces.second) if second else None
-        """Their mean products of all offsets (m, d, d), m^2, if they are asked for."""
+        """Their mean products of all offsets (m, d, d), m^2, if `second`."""
         self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
         """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return by how many cells corners of each of so many parts (count,) have moved at most since they were cut.
+        """Return the largest motion of corners since the cut, in cells, for each of `count` parts (count,).
 
-        part (n,): of each point.
+        part (n,): number of the part of each point.
         """
         far = np.zeros(count)
         np.maximum.at(far, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
         return over_all(self.grid.comm, far, MPI.MAX)
 
     def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-        """Return which parts (count,), see `moved`, are still where they were cut, but for `STAYS`."""
+        """Return for which parts (count,), see `moved`, the cut is still valid: motion up to `STAYS`."""
         return self.moved(points, part, count) <= STAYS
 
     def to_cells(self, values: NDArray) -> NDArray:
@@ -151,7 +151,10 @@ class CutDomains(Keyed):
         return self._travel.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,) and centroids (m, d), m, of pieces of given volumes, m^d; in axisymmetry in the plane."""
+        """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
+
+        volume (m,): volumes of the pieces, m^d.
+        """
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -163,7 +166,7 @@ class CutDomains(Keyed):
         return np.stack(means, axis=1).reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the same means of values at the pieces' centroids in the plane, in axisymmetry by area."""
+        """Return means like `mean` of values at centroids in the plane; in axisymmetry weighted by area."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
@@ -171,15 +174,15 @@ class CutDomains(Keyed):
         return total / whole
 
     def surface(self, faces: Surface) -> Patches:
-        """Return points of integration on the faces that this process's points have.
+        """Return quadrature points on the faces of a surface that belong to points of this process.
 
-        The cell is that of a place just under the surface, which holds a piece of the domain: its
-        shape functions, continued to the surface, put the load on nodes that have stiffness.
+        Their cell contains the position just under the surface, and a piece of the domain.  Its shape functions are
+        extended to the surface.  They apply the load to nodes with stiffness.
         """
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the same of several surfaces: cut all at once they take the time of one."""
+        """Return the quadrature points of several surfaces; one cut of all takes the time of one surface."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -214,33 +217,33 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""
+        """Return the Q1 field u (nodes, d) at the points (n, d), for points without domains."""
         travel, cells, x = self._followed
         return travel.back(self.grid.at(cells, x, u))
 
     def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
-        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), and what they follow besides, m.
+        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction there, m.
 
-        filled (cells,): which local cells hold something.
+        filled (cells,): which local cells contain material.
         """
         travel, cells, x = self._followed
         return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """The way to the owners of the cells of corners or points, these cells, and the positions."""
+        """Exchange with the owners of the cells of corners or points, these cells, and the positions, m."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim
         at = np.repeat(np.arange(n), 2**d if self.domains else 1)
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
-        # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
+        # rounding must not assign a corner on a grid line to a cell outside the domain
         cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
         travel = Exchange(grid.comm, grid.owner(cell))
         return travel, grid.local(travel.send(cell)), travel.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
+        """Return the displacements (m, d), m, of the pieces' centroids, from the corners of their domains."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
@@ -249,11 +252,11 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic cells (m,) of places x (m, d), m, in or on the domains of points (m,)."""
+        """Return the lexicographic cells (m,) of positions x (m, d), m, in or on the domains of points (m,)."""
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
+        """Return the cells (m,) of positions in domains; if the domain has no piece there, of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
@@ -272,7 +275,7 @@ class CutDomains(Keyed):
 
 
 def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
-    """Return one piece a point, at the point; a cell that holds points has open faces."""
+    """Return one piece a point, at the point; all faces of a cell with points are open."""
     n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     h = grid.sizes_of(number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of domains, and volume ratios of cells, as corners tell them, whichever way they have taken."""
+"""Deformation gradients of particle domains and volume ratios of cells from corners, independent of their path."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determi
 def gradient(
     corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
 ) -> NDArray[np.float64]:
-    """Return the mean deformation gradient (n, d, d) of domains over the simplices that the cut knows.
+    """Return the mean deformation gradient (n, d, d) of particle domains, over the simplices of the cut.
 
-    In axisymmetry (n, 3, 3): hoops stretch as the radius of the centroid, so det F is the ratio of the rings' volumes.
-    In 2D the diagonals tell all of it, and det F is the ratio of the areas.  In 3D F is scaled to that of the volumes,
-    from which the determinant of the mean of a twisted hexahedron differs by second order.
+    In axisymmetry (n, 3, 3).  The circumferential stretch follows the radius of the centroid, so det F is the ratio of
+    the ring volumes.  In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled to the
+    ratio of the volumes.  For a twisted hexahedron the mean gradient misses this ratio by a second-order term.
 
     Parameters
     ----------
     corners, reference : (n, 2^d, d), m
-        Corners now, and those of the domains at rest.
+        Corners now, and at rest.
     """
     if corners.shape[2] == 2:
         dx, dX = (y[:, [3, 2]] - y[:, [0, 1]] for y in (corners, reference))
@@ -43,9 +43,9 @@ def gradient(
 def _of_hexahedra(
     corners: NDArray[np.float64], reference: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean F (n, 3, 3) over the simplices, and the volumes at rest (n,), m^3, of which it is a derivative.
+    """Return the mean F (n, 3, 3) over the simplices, and the volumes at rest (n,), m^3.
 
-    Sums over corners of x_k and dV/dX_k, of the volumes by faces, with the points last.
+    F is the sum over corners of x_k and dV/dX_k, over V.  Arrays have the points last.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = np.zeros_like(X)
@@ -64,19 +64,20 @@ def _of_hexahedra(
 def cell_ratios(
     cut: CutDomains, points: MaterialPoints, share: NDArray[np.float64], flows: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the volume ratios (m,) with which the pieces of a cut begin a step where cells see one.
+    """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    That of a cell is the volume that the corners of its domains tell over that at rest: it remembers no path, and what
-    the cell does not see of it does no work.  By increments alone points would drift from the volumes of their domains,
-    which nothing would bring back.  All others begin with the points' own, and so do cells in which soil has yielded:
-    beside what flows volumes of domains tell nothing.
+    With mean dilatation the ratio of a cell is the volume of its domains by their corners over the volume at rest.
+    It is independent of the path, and its variation within the cell does no work.  Ratios updated by increments alone
+    would drift from the volumes of the domains without a restoring force.  Other pieces have the ratio of their point.
+    So do cells with yielded soil, because corner volumes are meaningless near plastic flow.
 
     Parameters
     ----------
     cut, points
-        The domains as cut by the cells, and the points as they are now.
+        Cut particle domains, and the points now.
     share : (n,)
-        Of what corners tell in the logarithm of the ratio, the rest is the points' own; 0 at those that see their own.
+        Weight of the corners' ratio in the logarithm, in [0, 1]; the rest is the point's ratio.  0 without mean
+        dilatation.
     flows : (n,)
         Which points have yielded.
     """

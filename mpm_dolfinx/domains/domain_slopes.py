@@ -8,7 +8,7 @@ bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a
 
 with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of the
 neighbours across faces that have the same material.  e is then corrected so that the pieces have the domain's volume at
-rest, int dV / det F.  Linear fields are reproduced on any mesh, and uniform fields stay uniform.
+rest, int dV / det F.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face, -1 without
 
     def elsewhere(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of the face that gives columns and face centres of the neighbours, and whether they exist.
+        """Return a function of the face: columns and face centres of the neighbours, and which neighbours exist.
 
         own (c, k): columns of these points; faces: centres (d, k), m, of each of their faces.
         """
@@ -140,7 +140,7 @@ def within(
     alike : (n, c)
         Equal rows mark points of the same material.
     """
-    # arrays have points or pieces last: rows of a few numbers each would take numpy several times as long
+    # points or pieces are the last axis: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction
     d, k = cut.grid.dim, F.shape[1]
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
@@ -150,7 +150,7 @@ def within(
     J, back = determinant(F), np.moveaxis(cofactor(F), 0, 2).swapaxes(0, 1)
     e = np.einsum("ijn,ajkn->aikn", back / J, slope)
     ratio = np.trace(e, axis1=1, axis2=2)
-    # about the mean by volumes at rest; and without the part of second order, which would change the domain's volume
+    # the mean is weighted by volumes at rest; the second-order part would change the domain's volume, so it is removed
     shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
     for a, b in np.ndindex(d, d):
         spread = sum_by(of, fraction * xi[a] * xi[b], len(F))
@@ -195,7 +195,7 @@ def _slopes(
                 B[a] += xi[a] * change
                 A[a] += xi[a] * xi
             some |= joined
-        A[axis, axis, ~some] += 1.0  # no neighbour tells this slope
+        A[axis, axis, ~some] += 1.0  # without a neighbour on this axis the slope is zero
     return np.einsum("abn,bmn->amn", _inverse(A), B).reshape(d, k, k, len(rows)), inverse
 
 

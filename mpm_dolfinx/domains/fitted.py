@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tensors at places in the bodies, fitted to those of the points around them (`LocalFit`)."""
+"""Tensors at positions in the bodies, fitted to the values of the points around (`LocalFit`)."""
 
 from __future__ import annotations
 
@@ -26,19 +26,18 @@ def fitted_at(
     xi: NDArray[np.float64],
     tensor: Callable[[MaterialPoints], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return tensors (m, k, k) at places in domains; on all processes together.
+    """Return tensors (m, k, k) at positions in particle domains; collective over the processes.
 
-    Points count that are of the place's body and material, by where they were at rest.  Places in domains that are not
-    there have any.
+    The fit uses points of the same body and material, weighted by distance at rest.  Removed domains get any value.
 
     Parameters
     ----------
     sizes
         Numbers of points of all bodies of the scene.
     id, xi : (m,), (m, d)
-        Numbers of the points, and places in their domains; the same on all processes.
+        Numbers of the points, and coordinates in their domains; the same on all processes.
     tensor
-        Gives it at points (n, k, k).
+        Function that returns the tensors (n, k, k) of points.
     """
     m = len(id)
     d = xi.shape[1]
@@ -68,7 +67,7 @@ def fitted_at(
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return the pairs of some places (m, d) and of points at x (n, d) within a reach (m,) along each axis, all m."""
+    """Return pairs of positions (m, d) and points at x (n, d) within a reach (m,) along each axis, all in m."""
     low, high = ((places + way * reach[:, None]).T for way in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""The lattice of corners that a body was seeded with, and the filter of what only neighbouring domains can see.
+"""Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
-A wave of two domains in the displacement of the corners moves no node of the grid, so that no stress acts against it:
-what crossing grid lines leaves of it would add up from cycle to cycle.  When the grid is reset the corners lose it,
+A displacement wave of the corners with a length of two domains moves no node of the grid, so no stress resists it.
+Corners that cross grid lines excite such waves, which would grow from cycle to cycle.  The filter damps them when the
+grid is reset,
 
     d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
-d their displacement since they were at rest, D_a the third difference along axis a where the lattice has four corners
-in a row (of rows of many widths the divided one, of weights as large in sum), s = `FAST` times the cells that they have
-crossed, at most 1: what hardly moves is left alone.  Quadratic fields stay as they are, also at the surface; along its
-axis a wave of two domains is taken away by the share s, one of eight by 0.003 s.  Nothing is filtered where domains
-have parted from their neighbours, and where soil has yielded: it does not come back, and its kinks are its own.
-Corners that a wall, a given displacement, a plate or another body holds stay where they are.
+with the displacement d of the corners since rest.  D_a is the third difference along axis a, over four corners in a
+row.  For rows of several widths it is the divided difference, with the same sum of absolute weights.  s is `FAST` times
+the number of cells that the corners have crossed, at most 1, so bodies nearly at rest are not filtered.  Quadratic
+fields remain unchanged, also at the surface.  Along its axis a wave of two domains loses the fraction s, a wave of
+eight domains 0.003 s.  Domains that have separated from their neighbours are not filtered.  Nor is yielded soil: its
+deformation is irreversible, and its kinks are physical.  Corners held by a wall, a prescribed displacement, a plate or
+another body do not move.
 """
 
 from __future__ import annotations
@@ -35,26 +37,26 @@ from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Share of a wave of two domains that is taken away, over the cells that it has crossed; at most all of it.
+"""Fraction of a wave of two domains that the filter removes, per crossed cell; at most 1.
 
 Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
-"""Layers of a lattice on both sides that the change of one depends on."""
+"""Layers of the lattice on each side that influence the change of a layer."""
 
 
 class Lattice:
-    """The domains and corners of a body that is there, and which corners are held; a mesh is not filtered.
+    """Particle domains and corners of a present body, and its held corners; bodies from meshes are not filtered.
 
     Parameters
     ----------
     body, start
         The body, and the number of its first point.
     given : (faces, axes)
-        Faces of a side, and the components that a condition gives them.
+        Faces of a side, and the components that a condition prescribes there.
     joined : (rows, corners)
-        Domains (m,) that touch other bodies, and which of their corners (m, 4) do.
+        Domains (m,) in contact with other bodies, and their corners (m, 4) in contact.
     """
 
     def __init__(
@@ -73,7 +75,7 @@ class Lattice:
             self._thirds = [_divided(body.corner_rows(axis)) for axis in range(self._dim)]
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._parted = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
-        # the numbers of corners that are held: a flag for each corner would be as large as the body, on every process
+        # numbers of held corners: flags of all corners would be as large as the body, on every process
         self._joined = np.unique(np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
@@ -85,15 +87,15 @@ class Lattice:
         self._held: Latest[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = Latest()
 
     def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return which points are the body's."""
+        """Return the indices of the body's points."""
         return np.flatnonzero((points.id >= self._start) & (points.id < self._stop))
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which components (m, 2^d, d) of the corners of domains conditions give."""
+        """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
         return self._held_of(ids)[0]
 
     def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return `given` of domains, and which of their corners (m, 2^d) other bodies hold."""
+        """Return `given` of domains, and which of their corners (m, 2^d) touch other bodies."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             number = self._nodes(ids)
@@ -108,9 +110,9 @@ class Lattice:
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return what the filter adds (m, 2^d, d), m, to the displacements d, alike, of the corners of domains.
+        """Return the change (m, 2^d, d), m, of the displacements d of the corners of domains by the filter.
 
-        crossed (m, 2^d): cells that they have crossed since the grid was reset.
+        d : (m, 2^d, d), m; crossed (m, 2^d): number of cells crossed since the grid reset.
         """
         if self._count is None:
             return np.zeros_like(d)
@@ -130,20 +132,20 @@ def _change(
     parted: NDArray[np.float64],
     thirds: Sequence[NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """Return what the filter adds (m, k) to values at places of a lattice.
+    """Return the change (m, k) of values on a lattice by the filter.
 
-    Processes share out the lattice by slabs across its first axis.
+    The lattice is distributed over the processes in slabs across its first axis.
 
     Parameters
     ----------
     shape, number
-        Places along each axis; lexicographic number (m,) of each row's place, which may have several.
+        Lattice sites along each axis; lexicographic number (m,) of the site of each row.  Rows may share a site.
     values : (m, k + 1)
-        Values, and last how many cells their place has crossed.
+        Values, and in the last column the number of crossed cells.
     parted : (k + 1,)
-        Places of which some of these differ by more are nobody's neighbours.
+        Tolerance: if rows of a site differ by more, its domains have separated and the site is left out.
     thirds : (4, n - 3) along each axis
-        Weights of third differences along n corners in rows of many widths, see `_divided`.
+        Weights of third differences along n corners, for rows of several widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -178,10 +180,10 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None = None,
     axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along axes, by default all; nan stands for no place.
+    """Return a box (..., k) of values after the filter along axes, by default all; nan marks missing sites.
 
-    Filters along two axes do not commute where the share differs, so the mean over their orders is taken: a body that
-    is turned by a right angle is filtered alike.
+    Filters along two axes do not commute where s varies.  The mean over all orders of the axes makes the result
+    independent of a rotation by a right angle.
     """
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
@@ -193,7 +195,10 @@ def _filtered(
 
 
 def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights (4, n - 3) of third differences at places (n,): quadratics have none, alternation has 8."""
+    """Return the weights (4, n - 3) of third differences at positions (n,); absolute weights sum to 8.
+
+    The differences of quadratic functions vanish.
+    """
     rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
     apart = rows[:, None] - rows[None]
     weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, apart).prod(axis=1)
@@ -203,7 +208,7 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along one axis; weights: see `_divided`, else even rows."""
+    """Return a box (..., k) of values after the filter along one axis; weights: see `_divided`, None for equal rows."""
     out, count = d.copy(), d.shape[axis]
     along, cells = np.moveaxis(out, axis, 0), np.moveaxis(crossed, axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
@@ -222,7 +227,7 @@ def _along(
 def lattices(
     bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
 ) -> list[Lattice]:
-    """Return the lattices of the bodies that are there; given: faces that conditions hold, and their components."""
+    """Return the lattices of the present bodies; given: faces with prescribed components, and these components."""
     start = np.cumsum([0, *map(len, bodies)])
     around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
     out = []
@@ -236,7 +241,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners conditions or walls give; walls: components that these hold."""
+    """Return which components (n, 2^d, d) of corners are prescribed or fixed; walls: fixed components of each wall."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -252,9 +257,9 @@ def given(
 def filtered(
     grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return what the filter adds to the corners (n, 2^d, d), m.
+    """Return the change of the corners (n, 2^d, d), m, by the filter.
 
-    then: the points when the grid was reset; free (n,): which of them are filtered.
+    then: the points at the grid reset; free (n,): which points are filtered.
     """
     out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
     for lattice in lattices:
@@ -265,5 +270,5 @@ def filtered(
 
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return how many cells the corners (n, 2^d) have crossed since the grid was reset; of points not free none."""
+    """Return the number of cells crossed by corners (n, 2^d) since the grid reset; 0 for points that are not free."""
     return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Conservative remap of the pore pressure from one grid to the next, of second order.
 
-In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of what the cell stores.  The
-slope s along an axis is van Leer's mean of the differences to the neighbours behind open faces, or to the pressure of
-a drained side, and nothing where one of them is missing; it is scaled so that nowhere in the cell the extremes of
-cell, neighbours and drained sides are passed.
+In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of the cell's storage.  The slope s
+along an axis is van Leer's mean of two differences: to the neighbours across open faces, or to the pressure of a
+drained side.  If one of them is missing, s is zero.  The slope is scaled so that the pressure in the cell stays between
+the extremes of cell, neighbours and drained sides.
 
-A piece of a domain takes the pressure at its own centroid and moves with the domain.  When the domain is cut
-anew, each cell that it lay in and still lies in keeps its pressure for the part that stayed; what newly lies
-in a cell takes the mean pressure of what left the others.  The places of the pieces are passed on in the same way;
-how far they then are from the true ones tells, with the domain's mean slope, what is still amiss.  Shares of every
-domain sum to one, and so does this correction to nothing: nothing is lost; where nothing moves nothing changes.
+A piece of a particle domain takes the pressure at its centroid and moves with the domain.  Then the domain is cut
+again.  In a cell that contained the domain before, the common part keeps its pressure.  A part that is new in a cell
+takes the mean pressure of the parts that left other cells.  The centroids of the pieces are remapped in the same way.
+Their error times the mean slope of the domain corrects the pressure.  The fractions of a domain sum to one, and this
+correction sums to zero, so the remap is conservative.  Without motion it changes nothing.
 
-What is told of the points, and taken along by none, is reconstructed up to sealed sides as well: see `up_to_surface`.
+Point pressures for output use a reconstruction up to no-flow sides, which is not transported: see `up_to_surface`.
 """
 
 from __future__ import annotations
@@ -34,13 +34,12 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """The pore pressure of a scene between two steps; arrays over the pieces of domains, ordered by point and cell.
+    """Pore pressure of a scene between two steps; arrays over the pieces of domains, ordered by point and cell.
 
-    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) share of the domain;
-    x : (m, d), m, where the centroid has moved to.  What pieces take to the next grid, None where all stay on this one:
-    pressure : (m,), Pa, at the centroid; slope : (m, d) of it, Pa/m; bounds : (m, 2) least and largest pressure that
-    any part of the piece may have, Pa.  What pieces have that stay, None where none does: of_cell, start : (m,), Pa,
-    pressure of the cell, and that when the grid was reset.
+    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) of the domain;
+    x : (m, d), m, present position of the centroid.  For pieces that go to the next grid, else None:
+    pressure : (m,), Pa, at the centroid; slope : (m, d) of it, Pa/m; bounds : (m, 2), Pa, smallest and largest pressure
+    allowed in the piece.  For pieces that stay, else None: of_cell, start : (m,), Pa, of the cell now and at the reset.
     """
 
     id: NDArray[np.int64]
@@ -59,32 +58,32 @@ class PiecePressures:
 
     @property
     def arrays(self) -> dict[str, NDArray]:
-        """Those that there are, by name."""
+        """Arrays that are not None, by name."""
         return {name: rows for name, rows in vars(self).items() if rows is not None}
 
     def migrated(self, exchange: Exchange) -> PiecePressures:
-        """Return the pieces of this process after each went to where its point goes."""
+        """Return the pieces of this process after the exchange of their points."""
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return the same of the mass potentials of a fluid of this bulk modulus, Pa: see `transport`."""
+        """Return mass potentials in place of pressures, for a fluid with this bulk modulus, Pa: see `transport`."""
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
     def less(self, slope: NDArray[np.float64]) -> PiecePressures:
-        """Return the same of what pressures differ by from those of an even slope (d,), Pa/m."""
+        """Return the pressures minus a field with a uniform slope (d,), Pa/m."""
         even = self.x @ slope
         bounds = self.bounds - even[:, None]
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
-        """Return the pieces of the points of these ids, or of all others."""
+        """Return the pieces of the points with these ids, or (kept=False) of all other points."""
         rows = np.isin(self.id, ids) == kept
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and others, of points that have not been on the grid: all leave it, none stays."""
+        """Return these pieces and others, of points new on the grid; no piece stays on this grid."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -97,7 +96,7 @@ class PiecePressures:
 
 
 def at_start(points: MaterialPoints) -> PiecePressures:
-    """Return what points carry that have not been in a cell yet: one piece each, of even pressure."""
+    """Return the pressures of points that have not been in a cell yet: one piece each, with uniform pressure."""
     n, p = len(points), points.pressure
     cell = np.full(n, -1)
     slope = np.zeros_like(points.x)
@@ -106,11 +105,11 @@ def at_start(points: MaterialPoints) -> PiecePressures:
 
 
 class CellPressures(NamedTuple):
-    """What slopes in owned cells are drawn from.
+    """Data for slopes in owned cells.
 
-    cells : (n,) owned cells; of all local cells: p : (c,), Pa; centroid : (c, d), m, relative to the midpoints; faces :
-    (c, d, 2) open shares, zero for empty cells; outer : (n, d, 2, 2) by axis and end, difference to the pressure on
-    drained sides ahead, Pa, and slope to them, Pa/m, nan where there is none.
+    cells : (n,) owned cells.  For all local cells: p : (c,), Pa; centroid : (c, d), m, relative to the midpoints;
+    faces : (c, d, 2) open fractions, zero for empty cells.  outer : (n, d, 2, 2), by axis and end: difference to the
+    pressure on a drained side, Pa, and slope to it, Pa/m; nan without a drained side.
     """
 
     cells: NDArray[np.int64]
@@ -137,7 +136,10 @@ class Reconstruction:
     def __call__(
         self, seen: CellPressures, origin: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return slopes (n, d) and bounds (n, 2), drawn from places (n, d), m, relative to the cells' midpoints."""
+        """Return slopes (n, d), Pa/m, and bounds (n, 2), Pa, of the pressures of cells.
+
+        origin (n, d), m: position of the cell's pressure relative to its midpoint.
+        """
         cells, p, centroid, *_ = seen
         jump, one_sided, _, drained = self._differences(seen)
         slope, low, high = van_leer(one_sided), *_spread(jump)
@@ -150,9 +152,9 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
 
     def _differences(self, seen: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return differences and slopes to neighbours and drained sides, and where there is the one or the other.
+        """Return differences and slopes to neighbours and drained sides, and which neighbours and sides exist.
 
-        All (n, d, 2), by axis and end, zero where there is neither.
+        All (n, d, 2), by axis and end; zero without a neighbour or drained side.
         """
         cells, p, centroid, faces, outer = seen
         there = self._neighbour[cells]
@@ -175,18 +177,18 @@ class Reconstruction:
     def up_to_surface(
         self, seen: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return pressures (m,), Pa, at places in owned cells (n,), also of second order in cells at the surface.
+        """Return pressures (m,), Pa, at positions in owned cells (n,), of second order also in cells at the surface.
 
-        At a sealed side the slope is that of the cell before it, or what its change leaves if that is less: linear
-        values are met, and steep ones not carried on.  No place passes cell, neighbours, drained sides, or what this
-        slope has at the surface.
+        At a no-flow side the slope is the slope of the next cell inside, or the linear extrapolation of the slopes if
+        this is smaller.  Linear fields are exact, and steep slopes are not continued.  Pressures stay within cell,
+        neighbours, drained sides, and the value of this slope at the surface.
 
         Parameters
         ----------
         x : (m, d), m
-            Places, relative to the cells' midpoints.
+            Positions relative to the midpoints of their cells.
         slot : (m,)
-            Place of each one's cell among the owned ones.
+            Index of the cell of each position among the owned cells.
         """
         cells, p, centroid, *_ = seen
         jump, one_sided, is_open, drained = self._differences(seen)
@@ -206,7 +208,7 @@ class Reconstruction:
         return p[cells[slot]] + share_within(rise, low, high, slot)[slot] * rise
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return slopes of owned cells (n, d) in a local array, that of active ghosts included."""
+        """Return slopes of owned cells (n, d) as an array over local cells, including active ghosts."""
         out = self._slope.x.array.reshape(-1, self.grid.dim)
         out[cells] = slope
         self._slope.x.scatter_forward()
@@ -222,7 +224,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     rise: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest shares (n,) of rises (m,) in cells by which none passes the cell's low or high (n,)."""
+    """Return the largest factors (n,) by which all rises (m,) in a cell stay between its low and high (n,)."""
     room, share = np.where(rise > 0, high[slot], low[slot]), np.ones(len(low))
     beyond = np.flatnonzero(np.abs(rise) > np.abs(room))
     np.minimum.at(share, slot[beyond], room[beyond] / rise[beyond])
@@ -230,12 +232,12 @@ def share_within(
 
 
 def _spread(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how far the least and the largest of neighbours are from the cells (n,), from differences (n, d, 2)."""
+    """Return the smallest difference, <= 0, and the largest, >= 0, to neighbours (n,), of differences (n, d, 2)."""
     return jump.min(axis=(1, 2)).clip(max=0), jump.max(axis=(1, 2)).clip(min=0)
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, that the new pieces bring to their cells, or mass potentials, which add up."""
+    """Return the pressures (m,), Pa, of the new pieces, or their mass potentials, which are additive."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -254,7 +256,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     share = stays / new.fraction
 
     def passed_on(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the new pieces have of values of the old: their own, and the mean of what left."""
+        """Return values of the new pieces: the old value on the common part, elsewhere the mean of parts that left."""
         mean = np.divide(sum_by(owner, leaves * values, n), left, out=np.zeros(n), where=left > 0)
         kept = np.zeros(len(new_key))
         kept[match] = values[before]
@@ -271,7 +273,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _within(amiss, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the share (m,) of a correction, the same for all pieces of a domain, that keeps to the bounds."""
+    """Return the factor (m,) of a correction, equal for all pieces of a domain, that respects the bounds."""
     first = np.flatnonzero(np.diff(owner, prepend=-1))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     room = np.where(amiss > 0, high[new.point] - pressure, low[new.point] - pressure)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cells that are filled anew with domains: which, with what, and what these get of the old ones."""
+"""Renewal of particle domains: choice of the cells, new domains in them, and transfer of values from the old ones."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 APART = 0.01
-"""Cells by which ends of the surface of two domains may part, and be one.
+"""Largest gap, in cells, between faces of two domains that still form one surface.
 
 Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
 """
 CRUMB = NEAR
-"""Area, in cells, below which a part of a domain is dropped; its mass goes to the other parts.  Source: as `NEAR`."""
+"""Area, in cells, below which a part of a domain is dropped; its other parts take over its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Share of a cell: where less is left of a domain, its cell is filled anew as well.
+"""Fraction of a cell: if less is left of a domain in a cell, this cell is renewed as well.
 
 Source: definition, half of an edge wide.
 """
 COVERED = 0.25
-"""Share of a cell by which its pieces may miss what its surface says that it holds.  Source: definition, one domain."""
+"""Largest error of the pieces' area against that bounded by the surface, in cells.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
-"""Face of a domain that each edge of the ring is."""
+"""Face of a domain for each edge of the ring."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 """Corners at which each face starts and ends, anti-clockwise."""
 
@@ -40,7 +40,8 @@ START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 class Parts(NamedTuple):
     """Parts of the surface in cells: rows (m,) of the faces, cell (m,), ends (m, 2, 2) in the cell, from 0 to 1.
 
-    t : (m, 2) places of the ends on the face, from 0 to 1; side : (m,) that of the cell on which it lies, else -1.
+    t : (m, 2) coordinates of the ends on the face, from 0 to 1; side : (m,) side of the cell if the part lies on it,
+    else -1.
     """
 
     row: NDArray[np.int64]
@@ -52,8 +53,10 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class OuterFaces:
-    """Faces of domains (m,) that are on the surface: point, number of the face, its key, and as seeded its length, m,
-    and reference positions of its ends (m, 2, 2), m, the lower one first.
+    """Faces of domains (m,) on the surface.
+
+    point, face, key: point, number of the face, key of the face.  area, ends: length as seeded, m, and reference
+    positions of the ends (m, 2, 2), m, the lower one first.
     """
 
     point: NDArray[np.int64]
@@ -64,7 +67,7 @@ class OuterFaces:
 
 
 class New(NamedTuple):
-    """New domains: corners (n, 4, 2), m; the group (n,) that shares what it gets; keys, lengths and ends of faces."""
+    """New domains: corners (n, 4, 2), m; group (n,) that shares received values; keys, lengths and ends of faces."""
 
     corners: NDArray[np.float64]
     group: NDArray[np.int64]
@@ -74,7 +77,7 @@ class New(NamedTuple):
 
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
-    """Return which domains (n, 4, 2) have an edge longer than so many cells, or are turned inside out in a part."""
+    """Return which domains (n, 4, 2) have an edge longer than `longest` cells, or an inverted part."""
     ring = corners[:, RING] / grid.h
     edge = np.roll(ring, -1, axis=1) - ring
     parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
@@ -83,16 +86,16 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
 
 
 class RefilledCells:
-    """What is renewed in one reset.
+    """Renewal of domains in one grid reset.
 
     Parameters
     ----------
     grid, points, body
         Grid, points, and the body of each (n,).
     flowed, needs
-        Which points (n,) may be renewed, and whose domains should.
+        Which points (n,) may be renewed, and which domains should be.
     faces, signs
-        The surface, and what acts on it, see `_signatures`.
+        Surface, and conditions on it, see `_signatures`.
     """
 
     def __init__(
@@ -119,9 +122,9 @@ class RefilledCells:
         filled = np.where(self.passed, self.region.area_of(self.cells), 1.0)
         barred |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
         self.chosen = self._chosen(flowed & needs, barred, size < SMALL)
-        """Which cells are filled anew."""
+        """Cells to renew."""
         self.gone = self._at(self.chosen)
-        """Which points (n,) lose their domains, or parts of these."""
+        """Which points (n,) lose their domains or parts of them."""
 
     def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which points (n,) have a piece in some cells."""
@@ -130,7 +133,7 @@ class RefilledCells:
         return out
 
     def _barred(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return the cells that hold other soil, several bodies, or faces on which not the same conditions act."""
+        """Return cells that cannot be renewed: with other soil, several bodies, or faces with different conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -140,7 +143,7 @@ class RefilledCells:
         barred[cell[~flowed[of]]] = True
         sign = signs[1][np.searchsorted(signs[0], self.faces.key[parts.row])]
         barred[parts.cell[sign == NONE]] = True
-        place = 5 * parts.cell + parts.side + 1  # within, and on each side
+        place = 5 * parts.cell + parts.side + 1  # inside the cell, or on one of its sides
         least, most = np.full(5 * self.cells, np.iinfo(np.int64).max), np.full(5 * self.cells, -1)
         np.minimum.at(least, place, sign)
         np.maximum.at(most, place, sign)
@@ -150,7 +153,7 @@ class RefilledCells:
     def _chosen(
         self, needed: NDArray[np.bool_], barred: NDArray[np.bool_], small: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the cells to fill anew: of points (n,) that need it, and where little of others would be left."""
+        """Return the cells to renew: cells of points (n,) that need it, and cells with small remainders of domains."""
         of, cell = self.pieces.point, self.cell
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[needed[of]]] = True
@@ -189,9 +192,9 @@ class RefilledCells:
         return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
 
     def _chains(self, barred: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
-        """Return the cells that the surface passes through, and what it leaves of those where it does so once.
+        """Return the cells crossed by the surface, and the material region of cells that it crosses once.
 
-        The others of them are barred.
+        Cells crossed more than once are barred.
         """
         inner = self.parts.side == NONE
         cell, x = self.parts.cell[inner], self.parts.x[inner]
@@ -231,7 +234,7 @@ class RefilledCells:
         return number[cells]
 
     def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the places (n, k, 2), m, of places y (n, k, 2) in cells (n,), from 0 to 1."""
+        """Return the positions (n, k, 2), m, of local coordinates y (n, k, 2) in cells (n,), from 0 to 1."""
         index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
         return self.grid.low + self.grid.h * (index[:, None] + y)
 
@@ -245,7 +248,7 @@ class RefilledCells:
         return self._beside(of, local, *_no_faces(len(of)))
 
     def partial(self) -> New:
-        """Return the new domains of cells that the surface passes through."""
+        """Return the new domains of cells crossed by the surface."""
         inner = np.flatnonzero(self.parts.side == NONE)
         parts = Parts(*(column[inner] for column in self.parts))
         order = np.argsort(parts.cell, kind="stable")
@@ -258,7 +261,7 @@ class RefilledCells:
         key, X = self._nearest(parts, order, cells[at], lower, upper)
         parent[at, face], ends[at, face] = key, X
         edge = np.linalg.norm(upper - lower, axis=1)
-        total = sum_by(cells[at], edge, self.cells)  # of all edges that it becomes
+        total = sum_by(cells[at], edge, self.cells)  # of all new edges on the surface
         area[at, face] = edge / total[cells[at]] * whole[cells[at]]
         return self._beside(cells, local, parent, area, ends)
 
@@ -270,8 +273,9 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return of edges in cells (m,) the key (m,) of the part of the surface nearest to their middles, and the
-        reference positions (m, 2, 2), m, of their ends, by the parts nearest to these.
+        """Return keys (m,) of edges in cells (m,), and reference positions (m, 2, 2), m, of their ends.
+
+        The key is that of the surface part nearest to the middle of an edge; for the ends the nearest parts count.
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
@@ -291,7 +295,7 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2), m, of places t (m,) on faces, from 0 at their start to 1."""
+        """Return the reference positions (m, 2), m, of coordinates t (m,) on faces, from 0 at their start to 1."""
         face = self.faces.face[row]
         turned = START[face] != FACES[2][face, 0]
         share = np.where(turned, 1 - t, t)[:, None]
@@ -306,7 +310,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains of cells (n,), with faces where sides of their cells are the surface."""
+        """Return new domains of cells (n,), with surface faces on sides of cells that belong to the surface."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -341,17 +345,17 @@ class RefilledCells:
 
     @property
     def rest(self) -> New:
-        """What domains that are gone leave beyond the renewed cells."""
+        """Remainders of removed domains outside the renewed cells."""
         return self._rest[0]
 
     @property
     def left(self) -> NDArray[np.int64]:
-        """Pieces of domains that are gone, beyond the renewed cells."""
+        """Pieces of removed domains outside the renewed cells."""
         return self._rest[1]
 
     @cached_property
     def _rest(self) -> tuple[New, NDArray[np.int64]]:
-        """What domains that are gone leave beyond the renewed cells, each piece a group; and these pieces."""
+        """Remainders of removed domains outside the renewed cells, each piece a group; and these pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.gone[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
@@ -359,7 +363,7 @@ class RefilledCells:
         rings, of = _convex(points.corners[pieces.point[left]], self.grid.h)
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
-        near = NEAR * self.grid.h.min()  # else rounding would part a surface on a grid line
+        near = NEAR * self.grid.h.min()  # tolerance: rounding would otherwise split a surface on a grid line
         polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
@@ -391,10 +395,13 @@ class RefilledCells:
             ends[at, face] = np.stack([X0 + s[:, None] * (X1 - X0) for s in t], axis=1)
         return New(corners, int(self.chosen.sum()) + number.ravel(), parent, area, ends), left
 
-    # ---- what they get --------------------------------------------------------------------------
+    # ---- transfer of values ---------------------------------------------------------------------
 
     def rise(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k) of values (points, k) in the cells of new domains, fitted to what lies there."""
+        """Return the slopes (n, 2, k), 1/m, of values (points, k) in the cells of new domains.
+
+        They are a least-squares fit to the pieces in the cell.
+        """
         pieces, h = self.pieces, self.grid.h
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -408,24 +415,24 @@ class RefilledCells:
         normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
         right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
         value, axes = np.linalg.eigh(normal)
-        some = value > SAME  # cells squared: along a row of places nothing is known across it
+        some = value > SAME  # cells squared: pieces in a row determine no slope across the row
         back = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / h[:, None]
         return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.left]])[group]]
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of domains that are gone, the group that each goes to, and its share of its domain."""
+        """Pieces of removed domains, the group that receives each, and its fraction of its domain."""
         pieces = self.pieces
         into = np.flatnonzero(self.chosen[self.cell] & self.gone[pieces.point])
         piece = np.concatenate([into, self.left])
         groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.left))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
-        return piece, groups, share / whole[pieces.point[piece]]  # of slivers that are dropped
+        return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped slivers
 
     def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return pairs of old and new domains: both, and the share of the old one's mass in the new one."""
+        """Return pairs of old and new domains: both indices, and the fraction of the old mass in the new domain."""
         piece, groups, share = self.into
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
@@ -435,7 +442,7 @@ class RefilledCells:
         common = np.zeros(len(of))
         rings, which = _convex(self.points.corners[old], self.grid.h)
         common += np.maximum(sum_by(which, rings.within(corners[at][which][:, RING]).area, len(of)), 0.0)
-        common += EPSILON * np.abs(volumes(corners[at]))  # what no piece lies on gets the mean of its cell
+        common += EPSILON * np.abs(volumes(corners[at]))  # a domain without an overlap gets the mean of its cell
         total = sum_by(of, common, len(piece))
         return old, at, share[of] * common / total[of]
 
@@ -447,7 +454,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return what new domains (n, ...) keep on their faces: means of what the surface in their cell had."""
+        """Return values of new domains (n, ...) on their faces: means over the old surface in their cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -463,12 +470,12 @@ class RefilledCells:
 
 
 def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return keys, lengths and ends of faces of n domains that have none on the surface."""
+    """Return keys, lengths and ends for n domains without faces on the surface."""
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 
 def _convex(corners: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[Polygons, NDArray[np.int64]]:
-    """Return domains (n, 4, 2) as convex polygons, whose edges have the numbers of faces, and the domain of each.
+    """Return domains (n, 4, 2) as convex polygons with face numbers of their edges, and the domain of each polygon.
 
     h (2,): edges of a cell, m.
     """
@@ -477,7 +484,7 @@ def _convex(corners: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[Polyg
     away = np.roll(ring, -1, axis=1) - ring
     before = np.roll(away, 1, axis=1)
     turn = before[:, :, 0] * away[:, :, 1] - before[:, :, 1] * away[:, :, 0]
-    bent = turn.min(axis=1) < -NEAR * h.prod()  # else rounding would choose a diagonal
+    bent = turn.min(axis=1) < -NEAR * h.prod()  # tolerance: rounding would otherwise choose a diagonal
     even = np.flatnonzero(~bent)
     out, of = [(ring[even], edge[even])], [even]
     at = np.flatnonzero(bent)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faces of renewed domains: which faces of bodies as seeded they stand for."""
+"""Faces of renewed domains, and the seeded faces of bodies that they represent."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of what points carry for each face: the key of the face as seeded on which it lies, -1 for none; its area as
-seeded, m; the reference positions of its ends, m."""
+"""Names of point data for each face: key of the seeded face, -1 for none; seeded area, m; reference ends, m."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return numbers (m,) of faces of domains in the plane, of points as seeded and by their numbers there."""
+    """Return keys (m,) of faces of seeded points, in the plane."""
     return 4 * np.asarray(point, dtype=np.int64) + face
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with what renewed faces have, none where they have nothing of it."""
+    """Return the points with data of renewed faces; if missing, they start without renewed faces."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -38,9 +37,9 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 class RenewedFaces:
     """Faces of renewed domains on surfaces (m,).
 
-    row : row among the faces of all these surfaces as seeded, on which it lies; at, face : index of the point, and
-    number of the face there; xi : (m, 2, 2) corners of the part of the face that counts; area, m, and ends (m, 2, 2),
-    m: see `AREA` and `ENDS`; old : which of places (n,) lie on faces as seeded, where this is of places.
+    row : index of its seeded face among the faces of all these surfaces; at, face : index of the point, and number of
+    the face there; xi : (m, 2, 2) corners of the part of the face within the surface; area, m, and ends (m, 2, 2), m:
+    see `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
     """
 
     row: NDArray[np.int64]
@@ -52,7 +51,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each place (n,), by its number among these; negative where it is on a face as seeded."""
+        """Return the face of each position (n,); number: index among these faces, negative on a seeded face."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -65,13 +64,13 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of parts and of whole faces, m, and their numbers, in place of those (n,) of faces as seeded."""
+        """Return areas of parts and whole faces, m, and face numbers (n,); renewed faces replace the given values."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
 
     def reference(self, X: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2), m, of places xi (n, 2), for those X of faces as seeded."""
+        """Return the reference positions (n, 2), m, of coordinates xi (n, 2); on seeded faces X (n, 2), m."""
         along = xi[np.arange(len(xi)), 1 - self.face // 2]
         share = (1 + along[:, None]) / 2
         new = self.ends[:, 0] + share * (self.ends[:, 1] - self.ends[:, 0])
@@ -79,7 +78,7 @@ class RenewedFaces:
 
 
 def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> RenewedFaces:
-    """Return the faces of renewed domains that lie on surfaces, one after the other."""
+    """Return the faces of renewed domains on several surfaces, concatenated."""
     at, face = np.nonzero(points.data[PARENT] >= 0)
     key = points.data[PARENT][at, face]
     area, ends = points.data[AREA][at, face], points.data[ENDS][at, face]
@@ -105,7 +104,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return from where to where (m,), from 0 to 1, edges with these ends (m, 2, 2), m, lie in a region (2, 2), m."""
+    """Return the interval (m,), (m,), in [0, 1], in which edges with ends (m, 2, 2), m, lie in a region (2, 2), m."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     way = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(way).max(axis=1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Where soils of different conductivity meet, whose pores drain: faces between cells, and cells that hold several.
+"""Borders of unsaturated soils with different conductivities: faces between cells, and mixed cells.
 
-Fluxes through these faces are those of `series`; all others are two-point ones as UFL has them.
+Fluxes through these faces follow from `series`; all other faces have two-point fluxes in UFL.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 
 
 class Borders:
-    """Faces between cells that do not conduct alike since the grid was reset.
+    """Faces between cells of different soil, since the grid reset.
 
     Parameters
     ----------
     contents
-        What the cells hold.
+        Contents of the cells.
     cells, alike, law
-        Of pieces (m,): their cells, what those (m, k) have in common that conduct alike, and their laws of retention.
+        Cells of pieces (m,), rows (m, k) that are equal for equal soil, and numbers of their retention curves.
     facets
         Faces of this process between two active cells.
     mixed
-        Cells that hold several soils, if any do.
+        Mixed cells, or None.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Borders:
         known = np.zeros((grid.num_local, 2 + alike.shape[1]))
         known[cells, 1:] = np.column_stack([law, alike])
         self.mixed = np.full(grid.num_local, -1)
-        """Numbers of the owned cells that hold several soils among these, else -1."""
+        """Index of each local cell among the owned mixed cells, else -1."""
         if mixed is not None:
             self.mixed[mixed.cells] = np.arange(len(mixed.cells))
             known[mixed.cells, 0] = 1.0
@@ -63,29 +63,29 @@ class Borders:
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
         self.facets, self.alike = facets[differ], facets[~differ]
-        """Faces of this process between cells that do not conduct alike, and the other ones."""
+        """Faces of this process between cells of different soil, and the other faces."""
         way = grid.midpoints[grid.facet_cells[self.facets]]
         way = way[:, 1] - way[:, 0]
         self._axis = np.abs(way).argmax(axis=1)
         falls = np.take_along_axis(way, self._axis[:, None], axis=1) < 0
         self._pair = np.where(falls, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
-        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # ask for those of any of ours
+        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # for requests of others
         self._cells = np.unique(np.append(self._pair, of_others))
         self._slot = np.searchsorted(self._cells, self._pair)
 
     def faces(
         self, laws: Any, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
     ) -> BorderFaces:
-        """Return the faces as the cells conduct.
+        """Return the faces for the present conductivities.
 
         Parameters
         ----------
         laws
-            Of the conductivities by the pressure.
+            Conductivities by the pressure, see `Laws`.
         contents, flow
-            What the cells hold, and how the filled owned ones conduct.
+            Contents of the cells, and conductivities of the filled owned cells.
         places, moved
-            Of the local cells (c, d), m: places of their pressures from their midpoints, and how they have moved since.
+            Of the local cells (c, d), m: positions of their pressures from their midpoints, and displacements.
         """
         grid, d = self.grid, self.grid.dim
         ways, slots = flow.mobility.ways, 1
@@ -114,7 +114,7 @@ class Borders:
         ]
         lengths = [np.maximum(length, EPSILON * way) for length, way in zip(lengths, across, strict=True)]
         gone = moved + places - contents.centroid
-        drift = (gone[other] - gone[first]) / 2  # what the middle of a face moves by is shared
+        drift = (gone[other] - gone[first]) / 2  # both cells share the motion of the face
         apart = [
             across[i][:, None] / 2 * unit - sign * contents.centroid[cells] + drift
             for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
@@ -135,7 +135,7 @@ class Borders:
         outer: NDArray[np.float64],
         fall: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield rows of owned cells that hold several soils, and k_r (k,) and slopes of these: see `Relative`."""
+        """Yield rows of owned mixed cells, and their k_r (k,) and slopes: see `Relative`."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -151,7 +151,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, ways: Ways) -> Ways:
-        """Return ways of the cells beside these faces, those of ghosts as their owners have them."""
+        """Return ways of the cells at these faces, with ghosts from their owners."""
         if self.grid.comm.size == 1:
             return ways
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in ways]
@@ -164,11 +164,10 @@ class Borders:
 
 @dataclass(frozen=True, eq=False)
 class BorderFaces:
-    """Faces between cells that do not conduct alike, as these conduct.
+    """Faces between cells of different soil, with their conductivities.
 
     borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); ways,
-    lengths, apart: two each, of the cells, see `through`, and vectors (m, d), m; weight (d,): of the fluid, N/m^3;
-    bulk: its bulk modulus, Pa.
+    lengths, apart: of both cells, see `through`, and vectors (m, d), m; weight (d,), N/m^3, bulk, Pa: of the fluid.
     """
 
     borders: Borders
@@ -183,7 +182,7 @@ class BorderFaces:
     bulk: float
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return what flows at pressures (2, m) of the cells, Pa; force (c, d): of inertia on the fluid, N/m^3."""
+        """Return the fluxes at pressures (2, m) of the cells, Pa; force (c, d): of inertia on the fluid, N/m^3."""
         weight = (
             self.weight
             if force is None
@@ -198,7 +197,7 @@ class BorderFaces:
 
 @dataclass(frozen=True)
 class BorderFlows:
-    """What flows through such faces: pair (2, m): local cells; flux (m,), m^d/s; slopes by both pressures (m,)."""
+    """Fluxes through such faces: pair (2, m): local cells; flux (m,), m^d/s; slopes by both pressures (m,)."""
 
     pair: NDArray[np.int64]
     flux: NDArray[np.float64]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Drained sides, seepage faces, rain, prescribed inflows: what passes through the sides of the bodies.
+"""Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
-What leaves a cell through a face is T r [p - p_out + rho_w g . (x_out - x)], T = A kappa / d by the distance d of the
-cell's centroid, or what is prescribed.  A seepage face lets nothing in: it is open where the flow at the start of the
-substep, and then that of a solution, asks for it (`SideFeeds.settle`), a primal-dual active set (Hintermueller, Ito and
-Kunisch 2002).  Rain is what is given, but no more than what the pressure of its pond presses in; what evaporates is no
-more than what the driest pressure sucks out.  A pond of volume V supplies V / dt besides, spread over its side, in the
-step whose rates change it.  So rain is what soaks in, what ponds and what runs off, to rounding.
+The outflow of a cell through a face is prescribed, or T r [p - p_out + rho_w g . (x_out - x)] with T = A kappa / d and
+the distance d of the cell's centroid.  A seepage face permits outflow only.  A primal-dual active set
+(Hintermueller, Ito and Kunisch 2002) opens faces with outflow, at the start of the substep and then after each
+solution (`SideFeeds.settle`).  The infiltration is the rain, at most the inflow under the pressure of its pond.
+Evaporation is at most the outflow to the driest pressure.  A pond of volume V additionally supplies V / dt in a step,
+uniformly over its side.  Infiltration, ponding and run-off sum to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from mpm_dolfinx.parallel.exchange import over_all
 THICK = np.sqrt(2)
 """Largest section of a cube over its face.  Source: exact bound (Ball 1986).
 
-A convex body behind a plane has its centroid at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face that is
-closer to the centroid of what its cell holds, or behind it, bounds a part of that only, and must not drain it at once.
+The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face closer
+to the centroid of its cell's material, or behind it, bounds only a part of the material, and must not drain all of it.
 """
 
 
@@ -46,14 +46,14 @@ class DrainedSides(Feeding):
     Parameters
     ----------
     setting
-        Where they are put.
+        Grid, materials and sides of the stage.
     outlets
         The conditions by name.
 
     Raises
     ------
     ValueError
-        Naming a condition whose side no point has, or two that act on the same faces.
+        A condition on a side without points, or two conditions on the same faces.
     """
 
     conditions, title = (Drained, Inflow, Rain), "open sides"
@@ -95,7 +95,7 @@ class DrainedSides(Feeding):
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
 
     def placed(self, wet: Wet) -> SideFeeds:
-        """Return the open sides where they were cut, with what they give at the time."""
+        """Return the open sides of the present cut, with their pressures and inflows at the time."""
         if self.varies:
             return SideFeeds(self._sides(wet), wet, self._grid, self._names, self._ponds)
         key = (wet.cut.key, wet.contents.key, wet.points)
@@ -119,7 +119,7 @@ class DrainedSides(Feeding):
         normal = area / size[:, None]
         distance = np.einsum("md,md->m", reach, normal)
         shape = size / np.maximum(distance, least)
-        if grid.axisymmetric:  # half-way to the centroid rings are as much longer or shorter
+        if grid.axisymmetric:  # circumference half-way to the centroid
             shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
         rains = np.isfinite(driest)
@@ -129,11 +129,11 @@ class DrainedSides(Feeding):
 
 @dataclass(frozen=True)
 class OpenFaces:
-    """Faces on open sides as the cells conduct; arrays over m faces.
+    """Faces on open sides with their conductances; arrays over m faces.
 
-    at (m,): place of the cell among the n active owned ones; conductance, inflow (m,): outflow per unit of the cell's
-    mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,): whether nothing may flow in;
-    reach (m, d): way from the cell's centroid, m.
+    at (m,): index of the cell among the n active owned cells; conductance, inflow (m,): outflow per unit of the cell's
+    mass potential, m^d/(Pa s), and inflow, prescribed or by the outer pressure, m^d/s; seeps (m,): outflow only;
+    reach (m, d): vector from the cell's centroid, m.
     """
 
     at: NDArray[np.int64]
@@ -143,11 +143,11 @@ class OpenFaces:
     reach: NDArray[np.float64]
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,), were it open both ways, m^d/s."""
+        """Return the outflow through each face (m,) if it were open in both directions, m^d/s."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,) by a unit of the cell's mass potential, m^d/(Pa s)."""
+        """Return the outflow through each face (m,) per unit of the cell's mass potential, m^d/(Pa s)."""
         return self.conductance
 
     rises = open_by
@@ -155,22 +155,21 @@ class OpenFaces:
     def aslant(
         self, fluid: Fluid, beyond: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return what flows besides through faces that see more pressure (m,), Pa: a flow, m^d/s, and a share."""
+        """Return the non-orthogonal correction for a pressure difference (m,), Pa: a flow, m^d/s, and a fraction."""
         return np.where(self.seeps, 0.0, self.open_by(fluid) * beyond * fluid.density[self.at]), 0.0
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what forces of inertia on the fluid drive out through each face (m,), m^d/s."""
+        """Return the outflow through each face (m,) by forces of inertia on the fluid, m^d/s."""
         along = np.einsum("md,md->m", fluid.force[self.at], self.reach)
         return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
 
 
 @dataclass(frozen=True)
 class UnsaturatedFaces(OpenFaces):
-    """The same of soil whose pores drain; conductance: over the mobility.
+    """Faces on open sides of unsaturated soil; conductance: at k_r = 1.
 
-    relative: mobilities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): potentials
-    beyond, less the weight of the fluid on the way, Pa; beyond (m,): pressures there, Pa; fall (m,): the weight on the
-    way, Pa.
+    relative: conductivities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): outer
+    potentials less the weight of the fluid up to them, Pa; beyond (m,): outer pressures, Pa; fall (m,): that weight.
     """
 
     relative: Relative
@@ -181,39 +180,38 @@ class UnsaturatedFaces(OpenFaces):
     fall: NDArray[np.float64]
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,), were it open both ways, m^d/s."""
+        """Return the outflow through each face (m,) if it were open in both directions, m^d/s."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
     def aslant(
         self, fluid: Fluid, beyond: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return what flows besides: as conductivities change by decades in a step, a share of what does anyway.
+        """Return the non-orthogonal correction: no flow, and a fraction of the two-point flux, in [-1, 1].
 
-        It is no more than that, so no soil is emptied by it.
+        Conductivities change by decades in a step, so the correction follows the flux; it is limited not to empty soil.
         """
         drives = fluid.pi[self.at] - self.outer
         share = np.divide(beyond, drives, out=np.zeros_like(beyond), where=drives != 0).clip(-1, 1)
         return 0.0, np.where(self.seeps, 0.0, share)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
+        """Return the outflow through each face (m,) per unit of the potential difference, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[0]
 
     def rises(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return by how much more leaves as the cell's pressure rises, never less."""
+        """Return the derivative of the outflow by the cell's pressure, >= 0, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r of the faces (m,) at the cells' pressures, and the slopes of what it lets through."""
+        """Return k_r of the faces (m,) at the cells' pressures, and the derivatives of k_r times the difference."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.beyond, self.fall)
 
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """The same where rain may fall; rain (m,): m^d/s, nan where there is none; pond, dry: faces at either bound.
+    """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at the bounds.
 
-    What leaves is minus the rain, or what leaves at the bound that it would pass.  So seepage is the rain's: `seeps` is
-    false there.
+    The outflow is minus the rain, limited by the outflows at the bounds.  It includes seepage, so `seeps` is false.
     """
 
     rain: NDArray[np.float64]
@@ -221,26 +219,26 @@ class RainedFaces(OpenFaces):
     dry: OpenFaces
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,), m^d/s."""
+        """Return the outflow through each face (m,), m^d/s."""
         wet = self.pond.outflow(fluid)
         return np.where(np.isnan(self.rain), wet, np.clip(-self.rain, wet, self.dry.outflow(fluid)))
 
     def aslant(
         self, fluid: Fluid, beyond: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return what flows besides; rain is what is given."""
+        """Return the non-orthogonal correction; zero on faces with rain."""
         return tuple(np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.aslant(fluid, beyond))
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what forces of inertia on the fluid drive out through each face (m,); rain is what is given."""
+        """Return the outflow through each face (m,) by forces of inertia, m^d/s; zero on faces with rain."""
         return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
+        """Return the outflow through each face (m,) per unit of the potential difference, m^d/(Pa s)."""
         return self.pond.open_by(fluid)
 
     def rises(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return by how much more leaves as the cell's pressure rises."""
+        """Return the derivative of the outflow by the cell's pressure, m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.rises(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.rises(fluid))
 
@@ -253,11 +251,11 @@ class SideFeeds(Feeds):
     sides
         Their faces.
     wet
-        When and where.
+        Data of the substep.
     grid
         Background grid.
     names, ponds
-        Of the conditions, by the numbers of the faces, and how deep water may pond, m; None: no rain.
+        Names of the conditions, by the numbers of the faces, and largest depths of ponds, m; None without rain.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -276,9 +274,9 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return sides that ponds supply with what they hold in a time, s, at their pressure; their volumes when full.
+        """Return sides with the pressure and the supply of ponds over a time dt, s, and the ponds' capacities, m^d.
 
-        ponds (n,): their depths, m, at most.
+        ponds (n,): their largest depths, m.
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
@@ -291,12 +289,12 @@ class SideFeeds(Feeds):
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
-        """What ponds hold at the start of the step, m^d, by number of the condition."""
+        """Volumes of ponds at the start of the step, m^d, by number of the condition."""
         held = self._before.get("ponded", {})
         return np.array([float(held.get(name, 0.0)) for name in self._names])
 
     def conducting(self, flow: Conduction) -> OpenFaces:
-        """Return the faces as the cells conduct."""
+        """Return the faces with their conductances."""
         faces = self._faces(self.sides, flow)
         if not any(self._rains):
             return faces
@@ -306,7 +304,7 @@ class SideFeeds(Feeds):
         return RainedFaces(*same, self.sides.rain, faces, dry)
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
-        """Return faces with these pressures beyond."""
+        """Return the faces for the outer pressures of `sides`."""
         at = self._contents.slot(sides.cells)
         conductance, inflow = sides.driven(at, flow)
         reach = flow.deformed(at, sides.reach)
@@ -317,12 +315,12 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, reach, *where)
 
     def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
-        """Open seepage faces as the flow asks for; their cells' pressures alone count for these."""
+        """Open seepage faces with outflow; cell pressures decide, without the correction."""
         self._flows = at.outflow(fluid) >= 0
         self._aslant, self._share = at.aslant(fluid, beyond)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return what leaves the cells, what flows aslant as it did at the start of the substep."""
+        """Return the outflow of the cells; the non-orthogonal correction is that of the start of the substep."""
         through, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             through = through + at.driven(fluid)
@@ -331,23 +329,23 @@ class SideFeeds(Feeds):
         return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover, gain)
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of what leaves."""
+        """Return the derivative of the outflow."""
         return sum_by(at.at, self._counts(at) * (1 + self._share) * at.rises(fluid), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
-        """Open and close seepage faces as the flow asks for; return how many do."""
+        """Open seepage faces with outflow and close the others; return the number of changes."""
         flows = at.outflow(fluid) > 0
         changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
         self._flows = flows
         return changes
 
     def outflows(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return what leaves through the sides of each condition, m^d/s, by name."""
+        """Return the outflow through the sides of each condition, m^d/s, by name."""
         sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return what of the rain does not soak in, m^d/s, by name of the conditions of rain."""
+        """Return the rain that does not infiltrate, m^d/s, by name of the rain."""
         if not any(self._rains):
             return {}
         left = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
@@ -356,7 +354,7 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return what leaves through the sides of each condition, and what falls on it (2,), m^d/s."""
+        """Return the outflow through the sides of each condition, and the rain on them (2,), m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
@@ -366,7 +364,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, passed: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return what has left through sides, what has run off them, and what ponds hold."""
+        """Return volumes of outflow through sides, of run-off, and of ponds, m^d."""
         if not any(self._rains):
             return {}
         flowed, fell = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in passed])
@@ -387,5 +385,5 @@ class SideFeeds(Feeds):
         return self._flows | ~at.seeps
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
-        """Return what leaves through each face (m,), m^d/s."""
+        """Return the outflow through each face (m,), m^d/s."""
         return np.where(self._counts(at), (1 + self._share) * at.outflow(fluid), 0.0) + self._aslant

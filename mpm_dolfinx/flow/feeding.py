@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What acts on the storage of the pore fluid: the one protocol of drained sides, inflows, sources.
+"""Protocol of the conditions on the pore fluid: drained sides, inflows, sources.
 
-To add a condition: give it a method `feeding(setting)`, which returns a `Feeding`.  It is placed twice: `Feeding` once
-a stage, where it finds its faces; `Feeding.placed` once a substep.  Its `Feeds` add to what leaves the cells as often
-as the residual is assembled.  The storage loops over them, and knows none by name.  So does the momentum over its own:
-`conditions/acting.py`.
+A new condition needs a method `feeding(setting)` that returns a `Feeding`.  `Feeding` is made once a stage, and finds
+its faces.  `Feeding.placed` is called once a substep, and returns `Feeds`.  These add to the outflow of the cells in
+each assembly of the residual.  `conditions/acting.py` is the same protocol for the momentum.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Wet(NamedTuple):
-    """When and where a condition acts in a substep.
+    """Data of a substep for conditions on the fluid.
 
-    cut, points: the domains as they are cut, and the points with the places that count; contents: of the cells;
-    pieces: points of integration, None where only open sides are asked for; t: end of the substep, s; drains: whether
-    pores drain under suction; dt: the step, s; outcome: of the step before.
+    cut, points: cut domains, and points with the present positions; contents: of the cells; pieces: quadrature points,
+    None if only open sides are needed; t: end of the substep, s; drains: whether pores drain under suction; dt: length
+    of the step, s; outcome: of the step before.
     """
 
     cut: CutDomains
@@ -42,9 +41,9 @@ class Wet(NamedTuple):
 
 
 class Fluid(NamedTuple):
-    """The fluid in the active owned cells at present: pressures p and mass potentials pi (n,), Pa; density (n,).
+    """Fluid in the active owned cells: pressures p and mass potentials pi (n,), Pa; relative density (n,).
 
-    The latter is that over the density at zero pressure.  force (n, d), N/m^3: of inertia, None without.
+    The density is relative to zero pressure.  force (n, d), N/m^3: of inertia, None without.
     """
 
     p: NDArray[np.float64]
@@ -54,9 +53,9 @@ class Fluid(NamedTuple):
 
 
 class Leaving(NamedTuple):
-    """What leaves the active owned cells (n,), m^d/s; turnover: in size, both ways; gain: what sources bring, in size.
+    """Outflow of the active owned cells (n,), m^d/s; turnover: absolute flows; gain: absolute sources.
 
-    Rounding is measured by the turnover, the balance by the gain too.
+    The turnover scales rounding errors, the gain scales the balance.
     """
 
     cells: NDArray[np.float64]
@@ -65,46 +64,46 @@ class Leaving(NamedTuple):
 
 
 class Feeds:
-    """What a condition does to the fluid of the cells in a substep; of what a class does not define it does nothing.
+    """Effect of a condition on the fluid of the cells in a substep; the defaults have no effect.
 
-    Arrays are over the n active owned cells.  `at` is what `conducting` has returned for the present displacements.
+    Arrays are over the n active owned cells.  `at` is the result of `conducting` for the present displacements.
     """
 
     linear: bool = True
-    """Whether what leaves is linear in the mass potentials, for good."""
+    """Whether the outflow is always linear in the mass potentials."""
     settles: bool = False
     """Whether it has an active set, see `settle`."""
     sides: OpenSides | None = None
-    """Faces beyond which it gives a pressure or a flux."""
+    """Faces with an outer pressure or a flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return what depends on how the cells conduct and have moved; kept as long as these stay the same."""
+        """Return data that depend on conductivities and motion of the cells; cached until these change."""
 
     def begin(self, at: Any, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
-        """Begin a substep; beyond (m,), Pa: what `sides` see more than the pressure of their cell, see `aslant`."""
+        """Begin a substep; beyond (m,), Pa: correction of the cell pressure at `sides`, see `nonorthogonal`."""
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
-        """Return what leaves the cells."""
+        """Return the outflow of the cells."""
         raise NotImplementedError
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
-        """Return the derivative (n,) of what leaves by the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative (n,) of the outflow by the cell's pressure, m^d/(Pa s)."""
         return 0.0
 
     def settle(self, at: Any, fluid: Fluid) -> int:
-        """Choose the active set anew; return how much of it, on this process, has changed."""
+        """Update the active set; return the number of changes on this process."""
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return what leaves the bodies by each condition, m^d/s, by name; all processes together."""
+        """Return the outflow from the bodies by each condition, m^d/s, by name; all processes together."""
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return what falls on the bodies and does not soak in, m^d/s, by name; all processes together."""
+        """Return the rain that does not infiltrate, m^d/s, by name; all processes together."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return what `volumes` needs of a substep, by name; all processes together."""
+        """Return the rates of a substep for `volumes`, by name; all processes together."""
         return {}
 
     def volumes(
@@ -112,13 +111,13 @@ class Feeds:
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return volumes since the conditions began, m^d, by quantity and name, after a step.
 
-        passed, seconds: of its substeps, see `passing`, and the times that these count, s.
+        passed, seconds: rates of its substeps, see `passing`, and their weights, s.
         """
         return {}
 
 
 def open_sides(feeds: Sequence[Feeds], dim: int) -> OpenSides:
-    """Return the open sides of all that acts on the fluid, with what they give."""
+    """Return the open sides of all conditions on the fluid."""
     return OpenSides.joined([one.sides for one in feeds if one.sides is not None], dim)
 
 
@@ -127,21 +126,21 @@ class Feeding:
 
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""
-    title: ClassVar[str] = "conditions of the user's own"
-    """What they are called where a scene lists what it has."""
+    title: ClassVar[str] = "user-defined conditions"
+    """Their name in the summary of a scene."""
     count: int = 0
-    """How many there are."""
+    """Number of conditions."""
     varies: bool = False
-    """Whether what the sides give changes with time or place."""
+    """Whether pressures or fluxes change with time or position."""
     surfaces: Sequence[Surface] = ()
     """Faces on which they act."""
 
     def placed(self, wet: Wet) -> Feeds:
-        """Return what they do in a substep."""
+        """Return the effect of the conditions in a substep."""
         raise NotImplementedError
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return points, some maybe often, whose bodies may gain or lose fluid by it."""
+        """Return points, with repetitions, of bodies that may gain or lose fluid."""
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Two-point fluxes of the pore fluid between cells, through what the bodies cover of the faces, and their damping.
+"""Two-point fluxes of the pore fluid through the covered parts of cell faces, and their damping.
 
-The coefficients of the forms are what cells hold, set anew whenever the grid is reset.  In a step in which a body moves
-the fluxes are those through the deformed cells, pulled back to the start of the step: with F = I + grad u at the
-centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
+The contents of the cells are coefficients of the forms, set at each grid reset.  In a moving body the fluxes through
+the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the material in a
+cell, its mobility kappa becomes J F^-1 kappa F^-T.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
-ALONG = 0.1  # of a unit normal: a side that looks less along an axis tells nothing of the pressure's slope there
+ALONG = 0.1  # component of a unit normal: sides with less do not determine the pressure's slope along that axis
 
 
 @dataclass(frozen=True)
 class Mobility:
     """Mobility of the filled owned cells.
 
-    mean (n,): of the pieces, m^2/(Pa s); share (n, d): of it along each axis; shift (n, d): way, m, from the centroid
-    to the place from which the resistance to the faces counts.  The last two are None where no cell holds several
-    conductivities.  Where pores drain, mean and share are those of full pores; shares (n, k): of soils whose pores stay
-    full and of each law of retention in the mean; ways: of the cells that hold several soils, see `series`; borders:
-    faces between cells that do not conduct alike.
+    mean (n,): of the pieces, m^2/(Pa s); share (n, d): mobility along each axis over the mean; shift (n, d): vector, m,
+    from the centroid to the position of the cell's pressure.  The last two are None without mixed cells.  In
+    unsaturated soil mean and share refer to saturated pores.  shares (n, k): parts of the mean by soils without a
+    retention curve and by each retention curve; ways: of mixed cells, see `series`; borders: faces between cells of
+    different soil.
     """
 
     mean: NDArray[np.float64]
@@ -52,7 +52,7 @@ class Mobility:
 
 
 class CellMotion(NamedTuple):
-    """What becomes of n cells in a step: F (n, d, d), displacement (n, d), m; hoops' stretch (n,) in axisymmetry."""
+    """Motion of n cells in a step: F (n, d, d), displacement (n, d), m; circumferential stretch (n,) or None."""
 
     F: NDArray[np.float64]
     moved: NDArray[np.float64]
@@ -61,10 +61,10 @@ class CellMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class Conduction:
-    """How the filled owned cells conduct, and what has become of them in the step.
+    """Conductivity and motion of the filled owned cells.
 
-    motion: since the start of the step, at the centroids; None where the body hardly moves.  weight (d,): of the fluid,
-    N/m^3, if there is gravity; bulk: its bulk modulus, Pa; relative: see `unsaturated`, where pores drain.
+    motion: since the start of the step, at the centroids; None for bodies nearly at rest.  weight (d,): of the fluid,
+    N/m^3, None without gravity; bulk: its bulk modulus, Pa; relative: in unsaturated soil, see `unsaturated`.
     """
 
     mobility: Mobility
@@ -79,7 +79,7 @@ class Conduction:
         return cofactor(self.motion.F), determinant(self.motion.F)
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the mobilities (n, d) along the axes, pulled back: `across` for the unit vectors, all at once."""
+        """Return the mobilities (n, d) along the axes, pulled back: `across` for all unit vectors."""
         kappa, share = self.mobility.mean[:, None], self.mobility.share
         kappa = np.repeat(kappa, dim, axis=1) if share is None else kappa * share
         if self.motion is None:
@@ -101,7 +101,10 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
-        """Return ways (m, d) to faces over those from which the resistance counts, along normals (m, d)."""
+        """Return ratios (m,) of distances to faces, along normals (m, d): from centroids over from pressure positions.
+
+        reach (m, d): vectors from the centroids to the faces, m.
+        """
         if self.mobility.shift is None:
             return 1.0
         way = (reach * normal).sum(axis=1)
@@ -109,7 +112,7 @@ class Conduction:
         return np.divide(way, rest, out=np.ones(len(way)), where=rest > 0)
 
     def deformed(self, at: NDArray[np.int64], way: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return ways (m, d) in some of the cells, m, as they are now."""
+        """Return the deformed vectors (m, d), m, in cells `at`."""
         return way if self.motion is None else np.einsum("mij,mj->mi", self.motion.F[at], way)
 
 
@@ -117,10 +120,10 @@ class Conduction:
 class OpenSides:
     """Open sides of the bodies; arrays over m faces.
 
-    number (m,): of the condition; cells (m,): owned cell behind each; shape: area over distance from the cell's
-    centroid, m^(d-2), zero where the inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s;
-    seeps: whether nothing may flow in; area (m, d): outward, m^(d-1); reach (m, d): way from the cell's centroid, m;
-    rain, driest (m,): what falls, m^d/s, and the least pressure beyond, Pa, nan where there is no rain.
+    number (m,): of the condition; cells (m,): owned cell behind each face; shape: area over distance to the cell's
+    centroid, m^(d-2), zero for a prescribed inflow; pressure: outside, Pa; given: prescribed inflow, m^d/s; seeps:
+    outflow only; area (m, d): outward, m^(d-1); reach (m, d): vector from the cell's centroid, m; rain, driest (m,):
+    rain, m^d/s, and lowest outer pressure, Pa, nan without rain.
     """
 
     number: NDArray[np.int64]
@@ -136,7 +139,7 @@ class OpenSides:
 
     @classmethod
     def joined(cls, several: Sequence[OpenSides], dim: int) -> OpenSides:
-        """Return the faces of several in their order, of none an empty one."""
+        """Return the concatenated faces of several open sides."""
         if len(several) == 1:
             return several[0]
         none, vectors = np.empty(0), np.empty((0, dim))
@@ -152,33 +155,32 @@ class OpenSides:
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
 
-        The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
-        filled ones.
+        The inflow is prescribed, or due to outer pressure and gravity; at (m,): index of the cells among filled ones.
         """
         shape = self.shape * flow.nearer(at, self.normal, self.reach)
         conductance = flow.across(at, self.normal) * shape
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,) beyond the faces, less the weight of the fluid on the way, Pa."""
+        """Return the outer mass potentials (m,), less the weight of the fluid up to the faces, Pa."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.reach) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
+        """Return pressure differences, Pa, and slopes, Pa/m, to drained sides (n, d, 2, 2), by axis and end of a cell.
 
-        Difference (Pa) of the pressure there to that of the cell, and slope (Pa/m) towards it; nan where there is none.
+        They are nan without a drained side.
 
         Parameters
         ----------
         at : (m,)
-            Place of the faces' cells among the filled ones.
+            Index of the faces' cells among the filled ones.
         p : (n,), Pa
             Pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.einsum("md,md->m", self.reach, self.normal)
-        # sides of an inflow have no conductance, seepage faces that let nothing out no pressure
+        # prescribed inflows have no conductance; closed seepage faces have no pressure
         drained = np.flatnonzero((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure)))
         at = at[drained]
         normal = self.normal[drained]
@@ -188,7 +190,7 @@ class OpenSides:
             looks = (2 * end - 1) * normal[:, axis]
             share = np.where(looks > ALONG, area * looks, 0.0)
             total = sum_by(at, share, len(p))
-            # along the side the pressure does not change, so its gradient is normal to it
+            # the pressure is constant along the side, so its gradient is normal to it
             for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
                 np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
         return out
@@ -196,7 +198,7 @@ class OpenSides:
 
 @dataclass(frozen=True)
 class PieceContents:
-    """What pieces bring to their owned cells; arrays over m pieces.
+    """Contributions of pieces to their owned cells; arrays over m pieces.
 
     cells (m,); weight: volumes, m^d; area, x (m, d): volumes and centroids, m, in axisymmetry in the plane; faces
     (m, d, 2): areas on the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa;
@@ -213,18 +215,18 @@ class PieceContents:
 
 
 class CellContents(Keyed):
-    """What the cells hold since the grid was reset; arrays over the active local cells are meaningful.
+    """Contents of the cells since the grid reset; local arrays are valid at active cells.
 
     Parameters
     ----------
     forms
-        The forms, whose coefficients are set.
+        The forms; their coefficients are set.
     pieces
-        What the pieces bring.
+        Contributions of the pieces.
     filled
         Owned active cells.
     active
-        These and the ghosts that are active.
+        Owned active cells and active ghosts.
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64], active: NDArray[np.int64]):
@@ -235,11 +237,11 @@ class CellContents(Keyed):
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
         self.volume = self.total(cells, weight)
-        """Volumes (n,) of what the filled cells hold, m^d."""
+        """Volumes (n,) of material in the filled cells, m^d."""
         self.area, area = pieces.area, self.total(cells, pieces.area)
         """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
-        """Filled share of the filled cells."""
+        """Volume fraction of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
         self.fixed_stress = self.total(cells, weight * pieces.fixed_stress)
@@ -259,14 +261,14 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active] = np.stack([lower[active], upper[active]], axis=2)
-        """Centroids (c, d) of what the cells hold from their midpoints, m; open shares of their faces (c, d, 2)."""
+        """Centroids (c, d) of the material in cells, from their midpoints, m; open fractions of faces (c, d, 2)."""
 
     def total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each filled cell."""
         return sum_by(self._slot[cells], values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the softness of the filled cells by that of the pieces (m,): the softest is the one that flows."""
+        """Return the softness of the filled cells: the largest softness (m,) of their pieces."""
         softest = np.ones(len(self.filled))
         np.maximum.at(softest, self._slot[self._cells], softness)
         return softest
@@ -276,7 +278,7 @@ class CellContents(Keyed):
     ) -> NDArray[np.float64]:
         """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa.
 
-        Shares (n,) of it count, less what pores store by their saturation (n,), 1/Pa.
+        share (n,): factor of tau; less (n,): storage by saturation, 1/Pa, subtracted from it.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values
@@ -296,7 +298,7 @@ class CellContents(Keyed):
         return self.grid.cell_nodes[self.filled]
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of the filled cells at their centroids by `nodal` displacements, m; some may rest."""
+        """Return the motion of filled cells at their centroids by `nodal` displacements, m; rests: cells at rest."""
         hoop = None
         moved = np.einsum("ndk,nk->nd", nodal, self._values)
         if self.grid.axisymmetric:
@@ -310,11 +312,11 @@ class CellContents(Keyed):
 
     @property
     def shape_values(self) -> NDArray[np.float64]:
-        """Values (n, 2^d) of the shape functions at the centroids of what the filled cells hold."""
+        """Values (n, 2^d) of the shape functions at the centroids of the material in filled cells."""
         return self._values
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the places of cells among the filled ones."""
+        """Return the indices of cells among the filled ones."""
         return self._slot[cells]
 
 
@@ -330,7 +332,7 @@ class FluxForms:
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     flows
-        Whether anything conducts; without, there are no fluxes.
+        Whether any material conducts; otherwise there are no fluxes.
     pressure
         DG0 pore pressure, Pa.
     bulk
@@ -338,7 +340,7 @@ class FluxForms:
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid as UFL, None without.
     relative
-        Conductivities by the pressures, where pores drain: see `unsaturated`.
+        Conductivities by pressures in unsaturated soil, see `unsaturated`, or None.
     """
 
     def __init__(
@@ -366,7 +368,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Share of the face that the body covers, times `Grid.around`, on the side that sign * n0 looks to."""
+            """Covered fraction of the face, times `Grid.around`, in the direction sign * n0."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -380,8 +382,8 @@ class FluxForms:
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
         apart = across * n0 - ufl.jump(self.centroid + self.moved)
         if inertial is not None:
-            # over two cells as the mass has it, a sixth of each node beside the face: by the face's value alone water
-            # that flows freely would have more mass, in what alternates from node to node, than all of the soil
+            # mean over two cells like the mass, with a sixth of each neighbouring node.  With the value at the face,
+            # freely flowing water would have more mass than all of the soil in modes that alternate between nodes
             along_n = [ufl.dot(ufl.grad(inertial)(side), n0) for side in "+-"]
             if grid.even:
                 along = ufl.avg(inertial) - across / 6 * (along_n[0] - along_n[1])
@@ -417,8 +419,8 @@ class FluxForms:
             self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
         if (weight is not None or relative is not None) and flows:
-            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
-            # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
+            # water at rest stays at rest: its pressure grows by its weight at zero pressure.  Both are in one form, so
+            # rounding errors are conservative, and those of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
             drives = ufl.jump(pressure) + fall
             driven = T * density * drives * ufl.jump(q) * dS
@@ -426,12 +428,12 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return the slope of T by k_r of a law: where next to nothing conducts squares of it vanish."""
+                    """Return the slope of T by k_r of a law, without squares of conductivities, which would vanish."""
                     return share * (
                         d0 * (k1 / resists) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resists) ** 2 * ufl.diff(k1, k)
                     )
 
-                # no cell loses less as it gets wetter, or more as its neighbour does: rounding would turn the direction
+                # the outflow of a cell rises with its pressure, and falls with the neighbour's, also with rounding
                 own, other = (
                     T * sign + drives * sum(by_k(one.k) * one.slopes[side] for one in between)
                     for side, sign in enumerate((1, -1))
@@ -447,9 +449,9 @@ class FluxForms:
         active: NDArray[np.int64],
         density: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the outflow of the local cells, m^d/s, by gradients (n, d), Pa/m, of some along some faces.
+        """Return the outflow of the local cells, m^d/s, for gradients (n, d), Pa/m, in `cells`, through `facets`.
 
-        active, density: the active local cells (c,), and the density (c,) of their fluid over that at zero pressure.
+        active, density: active local cells (c,), and their fluid density (c,) over the density at zero pressure.
         """
         self.density.x.array[active] = density
         self._sum.x.array[active] = 0.0
@@ -461,7 +463,7 @@ class FluxForms:
         return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
-        """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
+        """Set the coefficients for the conductivities of filled owned cells; return their mobilities (n, d) by axis."""
         d = self.grid.dim
         filled = contents.filled
         shift = flow.mobility.shift
@@ -469,7 +471,7 @@ class FluxForms:
         if self.relative is not None:
             self.relative.set_shares(filled, flow.mobility.shares)
         values = {self.mobility: mobility}
-        if shift is not None:  # the fluid's weight is that at the centroids nevertheless
+        if shift is not None:  # the fluid's weight still refers to the centroids
             values[self.centroid] = contents.centroid[filled] + shift
         if self.gravity:
             moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved

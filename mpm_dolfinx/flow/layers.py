@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""How cells conduct that hold several conductivities: along lines through them, axis by axis.
+"""Mobility of cells with several conductivities, from lines through the cell along each axis.
 
-What lies one after the other on a line resists in series; lines side by side conduct in parallel.  So a cell's mobility
-along an axis is the mean over lines of their harmonic means (Cardwell and Parsons 1945): exact for layers along the
-grid, across and along them, however many a cell has.  Aslant, a seam stays a barrier as it crosses all lines of some
-cell between its sides, and a drain conducts as some lines stay in it: both need to be a cell thick.
+Soils along a line are in series; lines are in parallel.  The mobility along an axis is the mean over lines of their
+harmonic means (Cardwell and Parsons 1945).  It is exact for any number of layers along the grid, in both directions.
+Inclined layers need a thickness of a cell: a seam is then a barrier for all lines of some cell, and a drain contains
+complete lines.
 
-Resistance counts from where the pressure is the mean of a line in steady flow: int (1 - s) dR to its lower end and
-int s dR to the upper one, s in [0, 1] along the line.  Their sum over faces is exact.  Where layers lie aslant by more
-than `ASLANT` the place moves to the more conductive end, or a drain would be cut wherever it passes from one row of
-cells to the next.  A piece counts as a box, the part of its domain's bounding box in the cell.
+The position of a cell's pressure is the point where steady flow along a line has its mean pressure.  The resistance to
+the lower end is int (1 - s) dR, to the upper end int s dR, s in [0, 1] along the line.  Their sum over faces is exact.
+For layers inclined by more than `ASLANT` the position moves to the more conductive end.  Otherwise a drain would be
+interrupted between rows of cells.  The shape of a piece is approximated by its domain's bounding box in the cell.
 
-Of a material whose conductivity depends on its deformation a cell holds many, but no layers: see `graded`.
+A conductivity that depends on deformation varies within a cell without layers: see `graded`.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ASLANT = 0.01
-"""Slope of layers on the grid from which a cell's pressure is rather that of its most conductive part.
+"""Slope of layers above which a cell's pressure moves to its most conductive part.
 
 Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03.
 """
 PAIRS = 2**16
-"""Pairs of pieces in a cell that are looked at, at a time."""
+"""Pairs of pieces in a chunk."""
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a piece that it crosses.
+    """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a crossed piece.
 
-    line, piece: numbers among the pieces of mixed cells; length: within the piece, cells; before: share of it that
-    counts for the way from the lower end to the place of mean pressure; total: length of all lines, cells.
+    line, piece: indices among the pieces of mixed cells; length: within the piece, cells; before: fraction of its
+    resistance between the lower end and the position of mean pressure; total: length of all lines, cells.
     """
 
     line: NDArray[np.int64]
@@ -54,12 +54,12 @@ class Lines:
 
 
 class MixedCells:
-    """The owned cells that hold several conductivities, and lines through them.
+    """Owned cells with several conductivities, and lines through them.
 
     Parameters
     ----------
     rows
-        Pieces (m,) in mixed cells, those of a cell one after the other.
+        Pieces (m,) in mixed cells, ordered by cell.
     cells
         Their cells (m,).
     low, high
@@ -69,9 +69,9 @@ class MixedCells:
     volume
         Their volumes (m,), m^d.
     contents
-        What the cells hold.
+        Contents of the cells.
     alike
-        What those pieces (m, k) have in common that conduct alike.
+        Rows (m, k) that are equal for pieces of equal conductivity.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, alike):
@@ -99,7 +99,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return, for each axis, lines of some pieces, the pieces that they cross, and the share in which they do.
+        """Return lines of some pieces, the pieces that they cross, and the fraction crossed, for each axis.
 
         first, count (m,): of the pieces in each piece's cell.
         """
@@ -120,10 +120,10 @@ class MixedCells:
         share: NDArray[np.float64] | None,
         now: NDArray[np.float64] | None = None,
     ) -> Mobility:
-        """Return the mobility of all filled cells, of their means (n,) and of those of all pieces, m^2/(Pa s).
+        """Return the mobility of all filled cells from their means (n,) and the mobilities of all pieces, m^2/(Pa s).
 
-        share (n, d): along the axes in the other cells, which is changed here; now: of all pieces at their pressures,
-        where pores drain.  The place is then the centroid, where layers do not lie aslant.
+        share (n, d): along the axes in cells that are not mixed, changed in place; now: of all pieces at their
+        pressures, in unsaturated soil.  The pressure is then at the centroid, unless layers are inclined.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -135,9 +135,9 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes and shifts, cells, of mixed cells (n, d), of those of their pieces.
+        """Return mobilities along the axes, and shifts in cells, of mixed cells (n, d); kappa: of their pieces.
 
-        mean: 0 where shifts are from the middle, not from the place of mean pressure.
+        mean: 1 for shifts to the position of mean pressure, 0 for shifts by inclination alone.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -161,14 +161,14 @@ class MixedCells:
     def ways(
         self, kappa: NDArray[np.float64], law: NDArray[np.int64], laws: int, shift: NDArray[np.float64] | None
     ) -> Ways:
-        """Return the ways (n, d, 2, ...) to the ends of what the mixed cells hold.
+        """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Ways`.
 
         Parameters
         ----------
         kappa, law
-            Of all pieces (m,): mobilities, m^2/(Pa s), with full pores, and numbers of their laws, below `laws`.
+            Of all pieces (m,): mobilities, m^2/(Pa s), of saturated soil, and numbers of their laws, below `laws`.
         shift
-            Of the filled cells (n, d): from their centroids to where their pressures are, m; None: nothing.
+            Of the filled cells (n, d): from their centroids to their pressure positions, m; None for zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -178,7 +178,7 @@ class MixedCells:
         return Ways(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in zip(*grown, strict=True)))
 
     def _way(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Ways:
-        """Return the ways (n, ...) from places (n,) along an axis, in the cell, to one of its ends."""
+        """Return the paths (n, ...) from positions (n,) in the cell along an axis to one of its ends."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
         length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part beyond the place
@@ -219,7 +219,7 @@ class MixedCells:
         return out._replace(beside=beside)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how much further (n,) than of mean pressure a cell's place lies, where layers are aslant."""
+        """Return the additional factor (n,) of a cell's shift for inclined layers."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -238,15 +238,15 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the share (n, d) of the mean along each axis, where the mobility changes steadily through a cell.
+    """Return the mobility along each axis over the mean (n, d), for a mobility that varies gradually in a cell.
 
-    Along its gradient the pieces resist in series, across it they conduct in parallel.  Aslant, the difference of the
-    two means counts along each axis by the variance that the linear change there explains, as for lines.
+    Along its gradient the pieces are in series, across it in parallel.  For other directions the difference of the two
+    means is distributed over the axes, by the variance of the linear variation along each.
 
     Parameters
     ----------
     offset, kappa
-        Of the pieces: places (m, d) from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
+        Of the pieces: positions (m, d) from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
     mean
         Mean mobility of the filled cells (n,).
     """
@@ -265,9 +265,9 @@ def graded(
 
 
 def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
-    """Return the owned cells that hold pieces that do not conduct alike, None if no process has any.
+    """Return the owned cells with pieces of different conductivity, None if no process has any.
 
-    alike: (m, k) what those pieces have in common that do.
+    alike: (m, k) rows that are equal for pieces of equal conductivity.
     """
     grid = cut.grid
     cells = cut.cells

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes between cells whose centroids do not lie across from one another, and through open sides aslant.
+"""Non-orthogonal correction of fluxes between cells and through open sides.
 
-The two-point flux takes the difference of two pressures for that across the face.  Where bodies lie aslant in their
-cells the centroids of what two of these hold differ along the face too, by t: up to half a cell, which is an error of
-the flux that does not fall with h.  With the gradients g of the pressure less the weight of the fluid in the cells
+The two-point flux uses the difference of two pressures as the difference across the face.  In bodies inclined to the
+grid two centroids also differ by a vector t along the face, up to half a cell.  The resulting error does not decrease
+with h.  With the gradients g of the pressure less the weight of the fluid in the cells
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t],
 
-and through an open side p - p_out + g . t, t the way along it from the foot of the centroid.  Gradients are those of
-least squares over the neighbours, the pressures of drained sides, and no flow across sealed ones, whose area is what
-the open faces of the cell leave to close it; linear pressures are exact.  They are limited: no cell's pressure as it
-counts at a face passes those of its neighbours.
+and through an open side p - p_out + g . t, with t along the side from the foot of the centroid.  The gradients are a
+least-squares fit to the neighbours, to the pressures of drained sides, and to zero flow across no-flow sides.  The area
+of the latter closes the surface of the material in the cell.  Linear pressures are exact.  The gradients are limited:
+corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import sum_by
 
 ALONG = 1e-4
-"""Share of a cell below which centroids lie across from one another."""
+"""Offset along a face, in cells, below which two centroids count as opposite."""
 NEAREST = 0.1
-"""Share of a cell: what is nearer counts as if it were as far in the least squares.
+"""Least distance, in cells, for weights of the least squares.
 
 Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03.
 """
 SIDES = 2.0
-"""Weight of all that is known beyond a cell's open sides in its least squares, by their areas, over a neighbour's.
+"""Total weight of a cell's open sides in its least squares, over the weight of a neighbour.
 
 Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03.
 """
 
 
 def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return those facets between two active cells whose centroids do not lie across from one another."""
+    """Return the facets between two active cells with centroids that are not opposite each other."""
     grid = contents.grid
     first, other = grid.facet_cells[facets].T
     apart = contents.centroid[other] - contents.centroid[first]
@@ -50,14 +50,14 @@ def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.
 
 
 class Gradients:
-    """Gradients of the head in cells whose centroids do not lie across from their neighbours' or from open sides.
+    """Gradients of the head in cells with centroids that are not opposite neighbours or open sides.
 
-    They are those of a cut: what is open and where, not what acts there.
+    They are valid for a cut, and depend on the geometry of the sides only.
 
     Parameters
     ----------
     contents, sides
-        What the cells hold, and open sides.
+        Contents of the cells, and open sides.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -81,7 +81,7 @@ class Gradients:
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
         off[at[(np.abs(foot / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
         self.rows = rows = np.flatnonzero(off)
-        """Places of these cells among the filled ones."""
+        """Indices of these cells among the filled ones."""
         apart = h[towards] if grid.even else grid.between(contents.filled[:, None], there, towards)
         way[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * apart
         self._here = contents.filled[rows]
@@ -102,7 +102,7 @@ class Gradients:
         self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight)
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
-        """Return the area vectors (n, d) of sealed sides in the filled cells, over that of a cell's face."""
+        """Return the area vectors (n, d) of no-flow sides in the filled cells, in areas of the cell's faces."""
         grid, share = contents.grid, contents.open[contents.filled]
         out = -(share[:, :, 1] - share[:, :, 0])
         for axis in range(grid.dim):
@@ -113,7 +113,7 @@ class Gradients:
     def _units(
         self, sealed: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the gradients by a unit of difference to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
+        """Return the gradients for unit differences to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
         known, d = self._known, self._way.shape[2]
         at = self._at[known]
         reach = self._reach[known]
@@ -157,23 +157,23 @@ class Gradients:
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
         rise = np.einsum("nd,nkd->nk", out, self._along)
-        share, slack = np.ones(len(out)), NEAR * (high - low)  # else rounding would decide where nothing rises
+        share, slack = np.ones(len(out)), NEAR * (high - low)  # tolerance for uniform pressures
         for room, most in ((-low, -rise.min(axis=1)), (high, rise.max(axis=1))):
             room = room + slack
             share = np.minimum(share, np.divide(room, most, out=np.ones(len(out)), where=most > room))
         return out * share[:, None]
 
     def through_sides(self, slope: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-        """Return what so many open faces (count,) see more than the pressure of their cell, Pa."""
+        """Return the correction of the cell pressure at open faces (count,), Pa."""
         out = np.zeros(count)
         out[self._faces] = np.einsum("md,md->m", self._foot, slope[self._at])
         return out
 
 
 class AslantFlow(NamedTuple):
-    """What flows beside the two-point fluxes.
+    """Non-orthogonal correction of the two-point fluxes.
 
-    forms, facets: over the faces of `off_facets`; gradients: of the cut; contents, sides: what the cells hold, open
+    forms, facets: over the faces of `off_facets`; gradients: of the cut; contents, sides: contents of the cells, open
     sides; weight (d,), N/m^3: of the fluid, None without gravity.
     """
 
@@ -185,9 +185,9 @@ class AslantFlow(NamedTuple):
     weight: NDArray[np.float64] | None
 
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what leaves the filled cells (n,) to others, m^d/s, at p (c,), Pa, and what open sides see.
+        """Return the additional outflow (n,), m^d/s, of the filled cells to others, and corrections (m,), Pa.
 
-        The latter (m,), Pa, is what they see more than the pressure of their cell.  bulk: of the fluid, Pa.
+        The latter correct the cell pressure at open sides.  p : (c,), Pa; bulk: of the fluid, Pa.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active

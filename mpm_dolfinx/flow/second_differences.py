@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Damping of the second differences of pressures along the axes: alternating ones, and no even gradient.
+"""Damping of second differences of the pressure along the axes.
 
     (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
 
-where h is the edge of the cell and d_+- are the distances between the centroids of what the cells hold.  A cell has a
-term along an axis where both its faces are open.  Pressures that alternate from cell to cell meet 16 w, as they meet 4
-times the coefficient of a damping of jumps; a gradient that is even meets nothing, so that steep pressures are not
-smeared, up to sides of the body.  The sum of H p over the cells is zero: no fluid is lost.
+with the edge h of the cell and the distances d_+- between centroids of the material.  A cell has a term along an axis
+if both its faces are open.  For alternating pressures the coefficient is 16 w; a damping of jumps has 4 times its
+coefficient.  A uniform gradient is not damped, so steep pressures are not smeared, up to the sides of the body.
+The sum of H p over the cells is zero, so the damping is conservative.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ def second_differences(
     grid
         Background grid.
     strength : (n, d), m^d/Pa
-        Of a damping of jumps through wholly open faces, of the owned active cells along each axis, >= 0.
+        Equivalent coefficient of a damping of jumps at open faces, of the owned active cells along each axis, >= 0.
     centroid : (c, d), m
-        Of what the local cells hold, from their midpoints.
+        Centroids of the material in the local cells, from their midpoints.
     opening : (c, d, 2)
-        Open shares of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
+        Open fractions of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
     """
     own = unknowns.owned
     number = unknowns.map.indices

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes through soils in series whose conductivities depend on the pressure: those between the places of two cells.
+"""Fluxes between two cells through unsaturated soils in series.
 
-On the way from the place of a cell's pressure to a face, and on to that of the next, soils lie one after the other.
-The pressures where they meet are unknowns of each face.  They are solved for by Newton's method, as what flows through
-one soil flows on through the next, and are condensed.  Each soil conducts as between two cells of its own (`fitted`).
-So steady flow through layers of exponential soil is met exactly, wherever they meet on the grid.
+Soils lie in series between the pressure positions of two cells.  The pressures at the borders of soils are local
+unknowns of each face.  Newton's method finds them from the continuity of the flux, and they are condensed.  Each soil
+conducts like a pair of cells with this soil alone (`fitted`).  Steady flow through layers of exponential soil is
+therefore exact at any offset from the grid.
 
-Lines through a cell, see `layers`, that meet one soil only on their way to a face conduct side by side; on those that
-meet several each takes its mean share of the way, in the order in which they are met.
+Lines through a cell (see `layers`) with a single soil up to the face conduct in parallel.  Lines with several soils are
+combined: each soil has its mean fraction of the length, in the order along the lines.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (
 
 
 class Ways(NamedTuple):
-    """Ways from the places of n cells' pressures to the ends of what they hold; arrays (n, d, 2, ...) by axis and end.
+    """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
-    beside (l,): mobilities, m^2/(Pa s), of lines that meet soil of one law only, by their share of all lines; the first
-    law is that of full pores.  Of the others, s soils one after the other: law (s,), -1 where there are less; length
-    (s,), of the way; resistance (s,), of the length by mobility and share of the lines, Pa s/m^2.
+    beside (l,): mobilities, m^2/(Pa s), of parallel lines with a single retention curve, weighted by their fraction of
+    all lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,), -1 for unused
+    entries; length (s,), fraction of the path; resistance (s,), length over mobility and fraction of lines, Pa s/m^2.
     """
 
     beside: NDArray[np.float64]
@@ -40,16 +40,16 @@ class Ways(NamedTuple):
     resistance: NDArray[np.float64]
 
     def at(self, *index) -> Ways:
-        """Return some of them."""
+        """Return the paths at an index."""
         return Ways(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Ways:
-        """Return the same ways (n, ...) to both ends along all axes (n, d, 2, ...)."""
+        """Return paths (n, ...) repeated for both ends of all axes (n, d, 2, ...)."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Ways(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
     def with_slots(self, count: int) -> Ways:
-        """Return them with room for so many soils one after the other."""
+        """Return paths padded to `count` soils in series."""
         more = [(0, 0)] * (self.law.ndim - 1) + [(0, count - self.law.shape[-1])]
         law, length, resistance = (
             np.pad(values, more, constant_values=v) for values, v in zip(self[1:], (-1, 0, 0), strict=True)
@@ -57,20 +57,20 @@ class Ways(NamedTuple):
         return Ways(self.beside, law, length, resistance)
 
     def eased(self, factor: NDArray[np.float64]) -> Ways:
-        """Return ways (n, d, 2, ...) that conduct so many times as well along the axes (n, d)."""
+        """Return paths (n, d, 2, ...) with mobilities times a factor (n, d) along the axes."""
         factor = factor[:, :, None, None]
         return self._replace(beside=self.beside * factor, resistance=self.resistance / factor)
 
 
 class Through(NamedTuple):
-    """Conductances (m,), m^2/(Pa s) over a length, and the slopes of the flux by the pressures on both sides."""
+    """Conductances (m,), m/(Pa s), and the slopes of the flux by the pressures on both sides."""
 
     conductance: NDArray[np.float64]
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def none(count: int, laws: int, slots: int) -> Ways:
-    """Return ways (count, ...) along which nothing conducts."""
+    """Return paths (count, ...) without conductance."""
     return Ways(
         np.zeros((count, laws)),
         np.full((count, slots), -1),
@@ -80,7 +80,7 @@ def none(count: int, laws: int, slots: int) -> Ways:
 
 
 class _Links(NamedTuple):
-    """Soils between nodes of m faces, flat: face, nodes, law, conductance, and what the weight drives by, Pa."""
+    """Soils between nodes of m faces, flat: face, nodes, law, conductance, and drop by the fluid's weight, Pa."""
 
     face: NDArray[np.int64]
     low: NDArray[np.int64]
@@ -107,20 +107,20 @@ def through(
     lengths: Sequence[NDArray[np.float64]],
     falls: Sequence[NDArray[np.float64]],
 ) -> Through:
-    """Return how faces conduct between two pressures.
+    """Return the conductances of faces between two pressures.
 
     Parameters
     ----------
     laws
-        Of the conductivities.
+        Conductivities by the pressure.
     p
         Pressures on both sides (m,), Pa.
     ways
-        Of one or two cells (m, ...): from the first place to the face, and from the second one.
+        Paths of one or two cells (m, ...), from their pressure positions to the face.
     lengths
-        Of these ways (m,), m.
+        Lengths of these paths (m,), m.
     falls
-        What the fluid's weight drives by along each, from the first side to the second (m,), Pa.
+        Pressure drop by the fluid's weight along each, from the first side to the second (m,), Pa.
     """
     counts = [np.maximum((way.law >= 0).sum(axis=1), 1) for way in ways]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -133,7 +133,7 @@ def through(
 
 
 class _Chain:
-    """Faces that have as many soils one after the other on their ways, with a node between each two."""
+    """Faces with equal numbers of soils in series, and a node at each border."""
 
     def __init__(self, laws: Laws, ways: Sequence[Ways], count: Sequence[int], p, lengths, falls):
         self._laws, self._p = laws, p
@@ -184,14 +184,14 @@ class _Chain:
                 low, high = np.where(step > 0, here, low), np.where(step < 0, here, high)
             there = np.clip(here + step, low, high)
             y, to = np.arcsinh(here / scale), np.arcsinh(there / scale)
-            # where it would turn back, no further than half of the way
+            # a step in the opposite direction is at most half of the step before
             most = np.where(went * (to - y) < 0, np.abs(went) / 2, np.minimum(1.25 * most, FARTHEST))
             far = (np.abs(to - y) > most) & (np.minimum(y, to) < 0)
             went = np.where(far, np.clip(to - y, -most, most), to - y)
             there = np.where(far, (scale * np.sinh(np.where(far, y + went, 0.0))).clip(low, high), there)
             done = (met | (np.abs(there - here) <= SAME * (np.abs(here) + size))).all()
             p[:, inner] = np.where(met, here, there)
-        raise NotConverged("soils in series: no pressure is found where they meet")
+        raise NotConverged("soils in series: no solution for the pressure at their border")
 
     def _flows(self, p: NDArray[np.float64]) -> _Flows:
         """Return the flows at pressures of the nodes (m, nodes), Pa."""
@@ -204,13 +204,13 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * drives, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return those of links that follow one another (m, nodes - 1)."""
+        """Return values of the links in series (m, nodes - 1)."""
         here = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(here, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
 
     def _step(self, flows: _Flows) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return steps (m, nodes - 2) of Newton's method, and where what flows in flows on but for rounding."""
+        """Return steps (m, nodes - 2) of Newton's method, and nodes with a continuous flux within rounding."""
         links, shape = self._links, self._rest.shape
 
         def at(node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -230,7 +230,7 @@ class _Chain:
         return x, met
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
-        """Return conductances and slopes (3, m) between the ends: in series along a way, side by side with others."""
+        """Return conductances and slopes (3, m) between the ends: soils in series, parallel to other lines."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
@@ -245,7 +245,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return conductance and slopes (3, m) of two in series, of the second where there is no first."""
+    """Return conductance and slopes (3, m) of two links in series; first may be None."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

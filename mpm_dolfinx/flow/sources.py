@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sources of the user's own in the storage of fluid: see `user_functions`, `conditions.Source`."""
+"""User-defined sources of the pore fluid: see `user_functions`, `conditions.Source`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Sources(Feeding):
     sources
         Functions.
     pieces
-        All points of integration.
+        All quadrature points.
     p
         DG0 pore pressure, Pa.
     t : s
@@ -52,7 +52,7 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the rate at which fluid comes to the filled cells at p, m^d/s, in a local array."""
+        """Return the inflow rate of the filled cells at p, m^d/s, in a local array."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
@@ -71,7 +71,7 @@ class Sources(Feeding):
         return SourceFeeds(self, wet)
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points with pieces in cells to which fluid comes."""
+        """Return the points with pieces in cells with a source."""
         return cut.pieces.point[cut.to_pieces(self.gain(pieces)[cut.cells] != 0)]
 
 
@@ -84,7 +84,7 @@ class SourceFeeds(Feeds):
         self.linear = sources.linear
 
     def leaving(self, at: None, fluid: Fluid) -> Leaving:
-        """Return minus what comes to the cells."""
+        """Return minus the inflow of the cells."""
         gain = self._sources.gain(self._pieces)[self._cells]
         return Leaving(-gain, gain=np.abs(gain))
 

@@ -1,31 +1,31 @@
 # SPDX-License-Identifier: MIT
-"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.  Sides: see `drained_sides`.
+"""Storage of the pore fluid: DG0 on the grid, a finite volume method.  For open sides see `drained_sides`.
 
-In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
+In each active cell, with J_Delta = det(I + grad u) (div u would turn a rotation into a volume change),
 
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
 
-r = exp(p / K_w) the density of the fluid over rho_w, that at zero pressure, in zeta that at (p_n + p) / 2 and on a face
-the logarithmic mean, so r [p+ - p-] is the jump of the mass potential (`fluid_content`): what leaves a cell enters its
-neighbour in mass.  The residual is that over r.  Its tangent leaves out what differences of r make, of neighbours and
-in the step.  A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold and d+-
-their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Distances from the
-centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  Where bodies lie aslant,
-`aslant` adds what centroids that are not across from one another leave out.  The sum over the cells is the fluid
-balance.  The change of the content is that of `fluid_content`, the integral over the step that of a substep of
-`time_integration`.
+r = exp(p / K_w) is the fluid density over the density rho_w at zero pressure.  In zeta it is taken at (p_n + p) / 2, on
+a face as the logarithmic mean.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass that
+leaves a cell enters its neighbour.  The residual is this equation over r; its tangent neglects differences of r.  A is
+the exact overlap of the body with the face, x+- are the centroids of the material in the cells, and d+- their distances
+to the face.  `layers` defines kappa and d of mixed cells.  Distances from the centroids keep the error at 0.2 % for any
+filling; half of the cell size would reach 12 %.  `nonorthogonal` corrects faces between centroids that are not opposite
+each other.  The sum over the cells is the fluid balance.  `fluid_content` defines the change of the content, and
+`time_integration` the integral over a substep.
 
-Corners of domains follow more than u, points change cells, and jumps are damped (below), so the volumes of domains part
-from the fluid that has come to them.  The points carry this difference, `owed`, and cells take it in by small shares in
-the next steps: `due`, at an even rate over the step.
+Corners follow more than u, points change cells, and pressure jumps are damped (below).  The volumes of domains
+therefore drift from their fluid content.  Points carry this volume defect, `owed`.  The next steps correct fractions of
+it, `due`, at a constant rate over the step.
 
-Q1 with DG0 violates the inf-sup condition as the flow within a step goes to zero: alternating pressures go unseen. A
-stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt
-the share of the step in which the rate at p counts.  A face then carries at least tau d A.  Where the flow is larger
-nothing is added.  In a steady state nothing is left, and no fluid is lost.  tau is a quarter of Silvester and
-Kechkar's patch value (Camargo, White and Borja 2021) for elastic soil.  What soil that flows needs more, up to a
-hundredfold, damps second differences only (`second_differences`): on jumps it would smear pressures that are steep.
+Q1 with DG0 violates the inf-sup condition for vanishing flow within a step: alternating pressures have no effect.  A
+stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with
+d = d+ + d- and the weight dt, s, of the rate at p.  A face then carries at least tau d A; with larger flow nothing is
+added.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil tau is a quarter of
+Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in plastic flow needs up to a hundred times
+more.  The additional damping acts on second differences only (`second_differences`), because damped jumps would smear
+steep pressures.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from mpm_dolfinx.points.parts import OfParts, Parts
 from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
 
 FILTER = 0.75
-"""Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
+"""Fraction of beta V that the filtered fixed-stress operator omits for checkerboard modes, in [0, 1].
 
 Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
 """
@@ -70,9 +70,9 @@ FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
 
 
 class CellPressure(NamedTuple):
-    """The pore pressure of the cells in a step, DG0, Pa: at the present iterate, and at the start of substep and step.
+    """Pore pressure of the cells in a step, DG0, Pa: at the present iterate, and at the start of substep and step.
 
-    The only place of it on the grid; that between two steps is `State.pieces`.
+    Between two steps the pressure is in `State.pieces`.
     """
 
     now: fem.Function
@@ -86,8 +86,8 @@ class StorageForms:
     Parameters
     ----------
     pieces
-        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`, and
-        where pores drain `retention`: specific yield and suction (Pa), see `unsaturated`.
+        Quadrature points with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`.  With a
+        specific yield also `drainage`: specific yield and suction (Pa), see `skeleton.unsaturated`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -99,20 +99,20 @@ class StorageForms:
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     symmetric
-        Take alpha dJ_Delta for the derivative of the content by J_Delta, for a symmetric Jacobian: the rest is of the
-        order of (p - p_n) / K_w, so Newton's method converges as fast.
+        Whether to use alpha dJ_Delta as derivative of the content by J_Delta, for a symmetric Jacobian.  The neglected
+        term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
     flows
-        Whether anything conducts; without, there are no fluxes.
+        Whether any material conducts; otherwise there are no fluxes.
     softens
         Whether soil may be softer than elastic.
     conductivity
-        Laws of the conductivity, None where no material has one.
+        Conductivity laws, None without any.
     feeding
-        What feeds the fluid in all stages.
+        Sources and open sides of all stages.
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
     retentions
-        The laws of retention of the scene, where some pores drain; the pieces then carry retention, lever and pores.
+        Retention curves of the scene, None without any; the pieces then carry retention, lever and pores.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class StorageForms:
         relative = Relative(pieces.grid, retentions) if self.retains and flows else None
         self.fluxes = FluxForms(pieces.grid, active, weight, flows, self.p, bulk, inertial, relative)
         self.feeding = tuple(feeding)
-        """What feeds the fluid in all stages."""
+        """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
         """Return the change of the fluid in the filled cells since the start of the step, m^d, in a local array."""
@@ -175,26 +175,26 @@ class StorageForms:
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return its derivative by the cell's pressure (filled cells,), m^d/Pa, and by displacements of its nodes.
+        """Return the derivatives of `change` by the pressure (filled cells,), m^d/Pa, and by nodal displacements.
 
-        The latter (filled cells, n), m^(d-1), are first those of alpha dJ_Delta, which the momentum takes, then those
-        of the content, where these are others.
+        The latter (filled cells, n), m^(d-1), are derivatives of alpha dJ_Delta, for the momentum, then of the content
+        if they differ.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         by_p, *by_u = np.split(sums, range(1, sums.shape[1], count), axis=1)
         return [by_p[:, 0], *by_u]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what the filled cells (n,) store by their saturation, m^d/Pa, and S d(chi p)/dp, m^d, at p."""
+        """Return the storage of the filled cells (n,) by their saturation, m^d/Pa, and S d(chi p)/dp, m^d, at p."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow that p and the fluid's weight drive from active cells to others, m^d/s, a local array.
+        """Return the outflow to other cells by p and the fluid's weight, m^d/s, of active cells, as a local array.
 
-        force (c, d): of inertia on the fluid in the local cells, N/m^3, if there is any.
+        force (c, d): of inertia on the fluid in the local cells, N/m^3, or None.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -208,11 +208,10 @@ class StorageForms:
 
 @dataclass(frozen=True)
 class Outflow:
-    """How the active owned cells lose fluid at present displacements.
+    """Conductances of the active owned cells at present displacements.
 
-    at: what each of the feeds makes of it, see `Feeds.conducting`; total (n,): outflow per unit of the cell's own
-    potential through all faces to other cells, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).  aslant: what
-    flows besides.
+    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow per unit of the cell's potential to other cells,
+    m^d/(Pa s); mobility (n, d): along the axes, m^2/(Pa s); aslant: non-orthogonal correction, or None.
     """
 
     at: Sequence[Any]
@@ -223,10 +222,10 @@ class Outflow:
 
 @dataclass(frozen=True)
 class Rates:
-    """Rates at which the owned cells lose fluid, m^d/s, or with `taken` what they lose in a time, m^d.
+    """Outflow rates of the owned cells, m^d/s, or with `taken` outflow volumes, m^d.
 
-    cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
-    turnover: what goes in and out; gain: what sources bring or take, in size.
+    cells: outflow less sources of each; lost: outflow from the bodies less sources; turnover: sum of inflow and
+    outflow; gain: absolute value of sources.
     """
 
     cells: NDArray[np.float64]
@@ -235,12 +234,12 @@ class Rates:
     gain: NDArray[np.float64]
 
     def taken(self, seconds: float) -> Rates:
-        """Return what the cells lose in a time."""
+        """Return the outflow volumes in a time, s."""
         return Rates(*(seconds * values for values in (self.cells, self.lost, self.turnover, self.gain)))
 
 
 class StorageSystem:
-    """Vectors and matrices of the pressures of one active set, complete when made.
+    """Vectors and matrices of the pressures of one active set.
 
     Parameters
     ----------
@@ -287,27 +286,27 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """What p and the fluid's weight drive between cells that conduct alike, if there is a weight."""
+        """Fluxes by p and the fluid's weight between cells of equal soil, None without a weight."""
         return self._alike(self._forms.fluxes.gravity)
 
     def _alike(self, form: FacetForm | None) -> FacetSum | None:
-        """Return a form over the faces between cells that conduct alike, see `Relative`."""
+        """Return a form over the faces between cells of equal soil, see `Relative`."""
         relative = self._forms.fluxes.relative
         return form and form.on(self._facets if relative is None else relative.alike(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return where on the grid this process's unknowns are, and none that are held: see `multigrid_solver`."""
+        """Return grid positions of this process's unknowns, and an empty list of fixed ones: see `multigrid_solver`."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def lost(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set what the residual gains by displacements, m^d: by the content and, with their slope, by the fluxes."""
+        """Set the change of the residual by displacements u, m^d: of the content and, with slopes, of the fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the cells lose to others at mass potentials (n,), Pa, by their differences alone, m^d/s."""
+        """Return the outflow to other cells, m^d/s, by differences of the mass potentials (n,), Pa."""
         self._potentials.array_w[:] = pi
         return (self.T * self._potentials).array_r
 
@@ -324,7 +323,7 @@ class StorageSystem:
         flow: Conduction,
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces; off: of `AslantFlow`, where there is any."""
+        """Assemble the fluxes through inner faces; off: arguments of `AslantFlow`, or None."""
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
         if (relative := self._forms.fluxes.relative) is not None:
@@ -340,7 +339,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of the fluxes between cells, where pores drain at p; force: see `StorageForms.driven`."""
+        """Assemble the matrix of fluxes between cells, in unsaturated soil at p; force: see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -354,10 +353,10 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Fluid volume out of balance in each cell (m^d), and what it is measured by in each part (parts,), m^d.
+    """Residual of the storage in each cell (m^d), and its scales in each part of the bodies (parts,), m^d.
 
-    exchanged: sum of all changes; round_off: what rounding may leave; off: sum of what the masses of the cells are off
-    by, in size; gain: change, plus what left, less sources; rates: at (u, p).
+    exchanged: sum of all changes; round_off: bound of rounding errors; off: sum of absolute mass errors of the cells;
+    gain: change, plus outflow, less sources; rates: at (u, p).
     """
 
     vector: PETSc.Vec
@@ -378,23 +377,23 @@ class StorageProblem:
     data
         The pieces.
     contents
-        What the cells hold.
+        Contents of the cells.
     feeds
-        What acts on the fluid.
+        Sources and open sides.
     flow
-        Assembles what leaves the cells at (u, p); called with whether this is the start of the substep.
+        Function that assembles the outflow at (u, p); its argument tells whether a substep starts.
     dt
-        Share of the step in which the rate at (u, p) counts, s.
+        Weight of the rate at (u, p), s.
     before
-        What the cells lose by the rate of the substep before.
+        Outflow volumes by the rate of the substep before.
     softness : (m,)
-        By how much the pieces are softer than elastic ones, where the forms' soil may be.
+        Softness of the pieces, see `SoftnessAtPoints`, if the soil may soften.
     due : (n,), m^d
-        What the active owned cells take in of what their points are owed, until the end of the substep.
+        Correction of the volume defect in the active owned cells until the end of the substep.
     inertial
-        Gives the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells at u, if there are any.
+        Function that returns the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
-        Suctions about which pores of these cells drain (n,), Pa, where any do.
+        Suctions at which pores of these cells drain (n,), Pa, or None.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -428,7 +427,7 @@ class StorageProblem:
         outflow = flow(before is None)
         reach = 4 * forms.grid.most**2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
-        if forms.retains:  # dry pores hardly couple the two balances, and what they take up stabilises as well
+        if forms.retains:  # dry pores hardly couple the two balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
             tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.ones(1)
@@ -438,7 +437,7 @@ class StorageProblem:
         """Whether jumps of the pressure are damped somewhere."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._aslant = self._begin(outflow)
-        """What flows beside the two-point fluxes at the start of the substep, m^d/s: no tangent sees it."""
+        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s, not in the tangent."""
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -448,7 +447,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return what the cells' softness (n,) adds to the damping tau (n,), 1/Pa, beside the flow."""
+        """Return the additional damping by the cells' softness (n,), for a damping tau (n,), 1/Pa, less the flow."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -463,22 +462,22 @@ class StorageProblem:
 
     @property
     def _density(self) -> NDArray[np.float64]:
-        """Density of the fluid halfway between start and end in the active owned cells, over that at zero pressure."""
+        """Mid-step density of the fluid in the active owned cells, over the density at zero pressure."""
         forms, owned = self.forms, self.system.unknowns.owned
         return np.exp((forms.p.x.array[owned] + forms.p_n.x.array[owned]) / (2 * forms.bulk))
 
     def outflows(self) -> dict[str, NDArray[np.float64]]:
-        """Return what leaves the bodies by each condition at (u, p), m^d/s, by name."""
+        """Return the outflow from the bodies by each condition at (u, p), m^d/s, by name."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return what falls on the bodies and does not soak in, m^d/s, by name."""
+        """Return the rain that does not infiltrate, m^d/s, by name."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return what `volumes` needs of a solved substep."""
+        """Return the rates of a solved substep for `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -498,15 +497,15 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Filled share of the cells, which is what their pressures count for."""
+        """Volume fraction of material in the cells, the weight of their pressures."""
         return self._contents.fill
 
     def sealed(self, lost: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much the cells' pressures would have risen, Pa, at fixed stress, by what they lost, m^d."""
+        """Return the undrained pressure rise of the cells at fixed stress, Pa, for the volumes that they lost, m^d."""
         return lost / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what errors of the pressures (n,), Pa, make of the water content, and its change in the step (n,)."""
+        """Return errors of the water content by pressure errors (n,), Pa, and its change in the step (n,)."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -514,12 +513,12 @@ class StorageProblem:
 
     @property
     def ring(self) -> float:
-        """Mean length of the rings that the cells' contents are in axisymmetry, m."""
+        """Mean circumference of the contents of the cells in axisymmetry, m."""
         whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume.sum(), self._contents.area.sum()]))
         return float(whole / area)
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
-        """Let what acts begin at the present pressures; return what flows aslant from cell to cell, m^d/s."""
+        """Start the substep of all feeds; return the non-orthogonal correction of fluxes between cells, m^d/s."""
         p, fluid = self.forms.p.x.array, self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, beyond = 0.0, np.zeros(sum(sides))
@@ -532,24 +531,24 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Relative accuracy that a linear solve needs: dry cells store next to nothing, and what is left is theirs."""
+        """Relative accuracy of a linear solve: dry cells store little, so the error must not end up in them."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
         self, dp: NDArray[np.float64], went: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
+        """Return limited pressure decreases, Pa, and changes of the suction's logarithm (n,).
 
-        Also, where pores drain, by how much the logarithm of their suction changes; went: the same of the step before.
+        dp (n,): decreases by Newton's method, Pa; went (n,): change of the logarithm in the iteration before.
         """
         p = self.forms.p.x.array[self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, went)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
-        """Open and close what asks for it by the flow at (u, p); return whether that has changed anything.
+        """Update the active sets by the flow at (u, p); return whether they have changed.
 
-        Newton's method solves for (u, p) with what is open as it is, and then settles it.
+        Newton's method solves for (u, p) with fixed active sets, then updates them.
         """
         if not self._settles:
             return False
@@ -561,12 +560,10 @@ class StorageProblem:
         self._flow(False)
 
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
-        """Return what gives the change (n,), m^d, of what the cells lose as displacements u change along a vector, m.
+        """Return a function: change of the outflow volumes (n,), m^d, for a change of u along a vector, m.
 
-        Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
-        taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
-
-        dofs: the active degrees of freedom of u.
+        It is a finite difference without a matrix (Knoll and Keyes 2004), of the conductivity laws and of the geometry
+        of the fluxes.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
         """
         h = self.forms.grid.least
         here, density = self._rates(self._flow(False)).cells, self._density
@@ -584,7 +581,7 @@ class StorageProblem:
         return along
 
     def assemble_residual(self) -> StorageResidual:
-        """Return the fluid volume out of balance in each cell at (u, p)."""
+        """Return the residual of the storage at (u, p)."""
         forms = self.forms
         system = self.system
         before = self._before
@@ -604,7 +601,7 @@ class StorageProblem:
         now = rates.taken(self.dt)
         mass = r.array_r + now.cells + before.cells
         r.array_w[:] = mass / density
-        # what rounding may leave: of the volumes and of the fluxes that cancel
+        # bound of rounding errors: of volumes, and of fluxes that cancel
         round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
         rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
         return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
@@ -637,20 +634,18 @@ class StorageProblem:
         return out
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
-        """Return the fluid (n,), m^d, that came to the filled owned cells in the step by fluxes and sources.
+        """Return the net inflow (n,), m^d, of the filled owned cells in the step by fluxes and sources.
 
-        Its volume is that at the density halfway between start and end, as in `change`.
-
-        rates: at the end of the substep.
+        Volumes refer to the mid-step density, as in `change`.  rates: at the end of the substep.
         """
         return (-rates.taken(self.dt).cells - self._before.cells) / self._density
 
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others.
+        """Assemble C = d/dp and B = d/du of the residual at (u, p); data: other pieces than in the residual.
 
-        of_suction: cells (c,), and what the forces on their nodes (c, n) gain by their pressures in laws, m^(d-1).
+        of_suction: cells (c,), and derivatives of their nodal forces (c, n) by p through suction in laws, m^(d-1).
         """
         forms = self.forms
         system = self.system
@@ -683,9 +678,9 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Of the filter L, in [0, 1]: 0 is the fixed-stress operator.  B K^-1 B^T falls from beta V for a smooth
-            pressure to a half (at nu = 0) where it alternates along one axis and to nothing for a checkerboard.
-            So does beta V - L, with L = sum over the faces of min(beta V+, beta V-) / (4 d) [p][q] <= beta V.
+            Weight of the filter L, in [0, 1]; 0 is the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
+            pressure, half of it (at nu = 0) for one that alternates along one axis, and zero for a checkerboard.
+            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q] <= beta V.
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

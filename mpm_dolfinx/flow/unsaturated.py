@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes in soil whose pores drain: conductivities by the pressures on both sides of a face.
+"""Fluxes in unsaturated soil: conductivities by the pressures on both sides of a face.
 
-Through a face soil conducts as on the mean over the pressures between the two sides (`retention.Conductance`): neither
-that of the wetter side, which would let a front run ahead, nor the mean of both.  Where the fluid's weight drives as
-well, that mean is `fitted`: steady flow through exponential soil is met exactly.  A cell that holds several soils
-conducts as `series` has it.
+The conductivity of a face is its mean over the pressures between the two sides (`retention.Conductance`).  The value of
+the wetter side would let a front run ahead.  With gravity this mean is `fitted`, so steady flow through exponential
+soil is exact.  For mixed cells see `series`.
 """
 
 from __future__ import annotations
@@ -49,10 +48,10 @@ class Between(NamedTuple):
 def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) -> Between:
     """Return k_r between the two sides of a face.
 
-    With k the mean of k_r over the pressures, x its jump over k, y = x fall / jump of the pressure, and
-    s(z) = sinh(z / 2) / (z / 2), it is k s(x + y) / (s(x) s(y)).  So an exponential k_r conducts as in steady flow
-    (Baker 1995), none more than on the wetter side; k is left where no weight drives (Kirchhoff 1894).  Where pressures
-    are next to the same k is the mean of both sides.
+    With the mean k of k_r over the pressures, the jump x of k_r over k, y = x fall / jump of the pressure, and
+    s(z) = sinh(z / 2) / (z / 2), it is k s(x + y) / (s(x) s(y)).  This is exact for steady flow with an exponential k_r
+    (Baker 1995), and never exceeds the wetter side.  Without gravity k remains (Kirchhoff 1894).  For nearly equal
+    pressures k is the mean of both sides.
 
     Parameters
     ----------
@@ -61,9 +60,9 @@ def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) 
     tables
         Of both sides: integral of k_r, Pa, k_r, its slope, 1/Pa, see `retention.Conductance`.
     fall
-        What the fluid's weight drives by from the first side to the second, Pa.
+        Pressure drop by the fluid's weight from the first side to the second, Pa.
     scale
-        Suction about which k_r falls, Pa.
+        Characteristic suction of k_r, Pa.
     of
         Functions for these arguments.
     """
@@ -97,12 +96,12 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """The laws of the conductivity by the pressure, by their numbers; 0: of pores that stay full."""
+    """Conductivities by the pressure, by the numbers of retention curves; 0: soil that stays saturated."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]
         self.scales = np.array([1 / TINY, *(law.scale for law in self.conductances)])
-        """Suctions about which they fall, Pa."""
+        """Characteristic suctions, Pa."""
 
     def between(
         self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], fall: NDArray[np.float64]
@@ -131,7 +130,7 @@ class Relative:
     Attributes
     ----------
     shares
-        DG0: shares of soils whose pores stay full, and of each of the laws, in a cell's mobility at k_r = 1.
+        DG0: parts of a cell's mobility at k_r = 1, by soil that stays saturated and by each retention curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -154,13 +153,13 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return by how much less the cell on a side of a face conducts, as UFL of k_r of each law there."""
+        """Return k_r of the cell on a side of a face, as UFL of k_r of each retention curve."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
-        """Set what forms see of the pressures of the local cells (c,), Pa.
+        """Set the coefficients of forms for pressures of the local cells (c,), Pa.
 
-        Return what flows through faces between cells that do not conduct alike, see `borders`; None where all do.
+        Return the fluxes through faces between cells of different soil, see `borders`, or None without such faces.
         force (c, d): of inertia on the fluid, N/m^3.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
@@ -170,7 +169,7 @@ class Relative:
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
     def alike(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return those of the faces between active cells on whose sides soils conduct alike."""
+        """Return the faces between active cells of equal soil."""
         faces = self._borders.value
         return facets if faces is None else faces.borders.alike
 
@@ -189,8 +188,8 @@ class Relative:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k_r (m,) of owned cells along normals (m, d) between their pressures and others (m,), Pa.
 
-        Also by how much k_r times what drives rises with their pressures.  fall (m,), Pa: what the fluid's weight
-        drives by out of the cells.
+        Also return the derivative of k_r times the potential difference by their pressures.  fall (m,), Pa: pressure
+        drop by the fluid's weight out of the cells.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, rises = shares[:, 0].copy(), shares[:, 0].copy()
@@ -211,7 +210,7 @@ class Relative:
         self.shares.x.scatter_forward()
 
     def set_borders(self, contents, flow, places: NDArray[np.float64], moved: NDArray[np.float64]) -> None:
-        """Set the faces between cells that do not conduct alike, by how the cells conduct: see `borders`."""
+        """Set the faces between cells of different soil for the present conductivities: see `borders`."""
         borders = flow.mobility.borders
         make = partial(borders.faces, self._laws, contents, flow, places, moved) if borders else lambda: None
         self._borders(object(), make)

@@ -130,7 +130,7 @@ def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows (c, k) of the local dofs of a scalar space, those of ghosts as their owners have them."""
+    """Return rows (c, k) of the local dofs of a scalar space, with ghosts from their owners."""
     if space.mesh.comm.size == 1:
         return rows
     carrier, out = fem.Function(space), np.empty_like(rows)

@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Modified Cam Clay at finite strain (Borja and Tamagnini 1998), with one local unknown; Barcelona's with suction.
+"""Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
-Multiplicative, in principal logarithmic strains, as Drucker and Prager's law: with the elastic volume strain e_v and
-deviator e (tension positive), pressure P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau| in Kirchhoff stress,
+Plasticity is multiplicative, in principal logarithmic strains.  With the elastic volume strain e_v and deviator e
+(tension positive), P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau| in Kirchhoff stress,
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
-flow associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  A step is implicit, from the trial
+and flow is associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  A step is implicit, from trial
 stresses P_t and Q_t, w = (Q_t / (M P_t))^2, with the plastic compaction kappa a and 6G dgamma / M^2 = exp(h) - 1:
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The unknown is d = 2 (h - a), by which the end is steeper than the trial: Q / (M P) = sqrt(w) exp(-d/2).  It gives
-a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho) from the yield surface, and all is smooth and monotone, at the
-critical state, where a says nothing, and at isotropic stresses too.
+The local unknown is d = 2 (h - a), the change of the stress ratio: Q / (M P) = sqrt(w) exp(-d/2).  The yield surface
+yields a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at the
+critical state, where a is zero, and at isotropic stresses.
 
-Where M^2 P_c > 6G (lambda - kappa) soil on the dry side softens faster than it unloads: its stress jumps, or the
+If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Its stress then jumps, or the
 step has no solution and is cut.
 """
 
@@ -43,7 +43,7 @@ GIVEN = {
     "kappa": "> 0",
     "initial_stress": "three normal effective stresses whose mean is compressive, < 0 Pa",
 }
-"""Constants that must be given, and what they may be."""
+"""Required constants and their ranges."""
 
 
 class _Follows(float):
@@ -54,14 +54,14 @@ class _Follows(float):
 
 @dataclass(frozen=True)
 class _FollowsByPlace:
-    """The same, as a function of places: P_0 / kappa of initial stresses and slopes, each a value or a function."""
+    """A bulk modulus P_0 / kappa as a function of place; initial stress and kappa are values or functions."""
 
     stress: object
     kappa: object
     follows: ClassVar[bool] = True
 
     def __call__(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the bulk moduli (m,), Pa, at places X (m, d)."""
+        """Return the bulk moduli (m,), Pa, at reference positions X (m, d), m."""
         at = [f(X) if callable(f) else np.asarray(f) for f in (self.stress, self.kappa)]
         return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
 
@@ -75,26 +75,25 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes lambda* and kappa* of ln v over ln P, first loading and unloading, -, 0 < kappa < lambda_, in Kirchhoff
-        stress.  An index C of v over the logarithm of the Cauchy stress, at the specific volume v, is C / (v - C) here.
+        Slopes lambda* and kappa* of ln v over ln P in first loading and unloading, -, 0 < kappa < lambda_, in Kirchhoff
+        stress.  A compression index C of v over the logarithm of the Cauchy stress corresponds to C / (v - C).
     initial_stress : (3,), Pa
-        Normal effective stresses at F = I, the last one out of plane in 2D, in axisymmetry along the hoops; tension
-        positive, their mean < 0.  The loads have to balance them.
+        Normal effective stresses at F = I, the last one out of plane in 2D, circumferential in axisymmetry; tension
+        positive, mean < 0.  They must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: how much larger the yield surface is at the start than that through the
-        initial stress.
+        Overconsolidation ratio, -, >= 1: initial size of the yield surface over the size through the initial stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
-        Not to be given: P_0 / kappa, at the start.
+        Must be left out: it is P_0 / kappa at the start.
 
-    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and
-    `consolidated`, ln of P_c over that at the start, in `points.data`.  Borja and Tamagnini (1998).
+    Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `consolidated`,
+    ln(P_c / initial P_c), in `points.data`.  Source: Borja and Tamagnini (1998).
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range, or is not given.
+        A constant out of its range, or missing.
     """
 
     bulk: Field = None
@@ -120,21 +119,21 @@ class ModifiedCamClay(Skeleton):
         super().__post_init__()
 
     def _set_bulk(self) -> None:
-        """Set the bulk modulus of the start, from which the scheme takes its scales."""
+        """Set the initial bulk modulus, which scales the scheme."""
         stress, kappa = self.initial_stress, self.kappa
         if callable(stress) or callable(kappa):
             bulk = _FollowsByPlace(stress, kappa)
         else:
             bulk = -np.mean(stress, axis=-1) / kappa
             bulk = bulk if np.ndim(bulk) else _Follows(bulk)
-        if self.bulk is None or getattr(self.bulk, "follows", False):  # of another one's constants: `replace`
+        if self.bulk is None or getattr(self.bulk, "follows", False):  # derived for another material before `replace`
             object.__setattr__(self, "bulk", bulk)
         elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=SAME)):
             raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out: it is P_0 / kappa")
 
     @property
     def nearly_incompressible(self) -> bool:
-        return True  # at the critical state it is
+        return True  # flow at the critical state is isochoric
 
     @property
     def pressure(self):
@@ -147,7 +146,7 @@ class ModifiedCamClay(Skeleton):
 
     @property
     def prestretch(self):
-        """Principal elastic stretches at F = I but for the volume's (3,)."""
+        """Isochoric principal elastic stretches at F = I (3,)."""
         return np.exp(self._deviator / (2 * np.asarray(self.shear)[..., None]))
 
     @property
@@ -158,20 +157,20 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def trial(F, prestretch, plastic):
-        """Return volume strain and square of the distortion, e_s^2 = 2/3 e : e, of the trial strain."""
+        """Return volume strain and squared deviatoric strain, e_s^2 = 2/3 e : e, of the trial strain."""
         strain = Trial(F, plastic, prestretch)
         e = strain.deviatoric
         return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
 
     @staticmethod
     def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the equation of d: the flow rule, on the yield surface."""
+        """Return the residual for d: the flow rule on the yield surface."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
         rule = ufl.conditional(
             ufl.lt(to.flow, -SAME), 1 / SAME, rule
-        )  # soil that softens fast has another root, back in time
+        )  # with fast softening there is a second root, with negative plastic flow
         return {"steeper": ufl.conditional(to.yields, rule, steeper)}
 
     @staticmethod
@@ -199,11 +198,11 @@ class ModifiedCamClay(Skeleton):
 
 
 LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference": "> 0 Pa and finite"}
-"""Constants of the loading-collapse curve, and their ranges."""
+"""Constants of the loading-collapse curve and their ranges."""
 
 
 def _dried(function: Callable) -> Callable:
-    """Return one of Modified Cam Clay's functions as it is under suction: of another lambda and P_c."""
+    """Return a function of Modified Cam Clay under suction, with lambda(s) and P_c(s)."""
     taken = Skeleton.taken_by(function)
 
     def of(**given):
@@ -232,41 +231,41 @@ def _dried(function: Callable) -> Callable:
 
 @dataclass(frozen=True, kw_only=True)
 class BarcelonaBasic(ModifiedCamClay):
-    """Modified Cam Clay whose yield surface grows with suction: soil that collapses as it gets wet.
+    """Modified Cam Clay with a yield surface that grows with suction, for soil that collapses on wetting.
 
     At a suction s = max(-p, 0) the yield surface in Bishop's stress has the size
 
         P_c / P_r = (P_c0 / P_r)^((lambda(0) - kappa) / (lambda(s) - kappa)),
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
-    the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  So soil of a constant
-    suction is Modified Cam Clay with lambda(s), and saturated soil with lambda(0).  Strength by suction, and swelling
-    on wetting, follow from Bishop's stress.  The suction is that of the end of a substep.  Where P_c0
-    has fallen to P_r, suction changes nothing.
+    the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  Soil at constant
+    suction is Modified Cam Clay with lambda(s), saturated soil with lambda(0).  Bishop's stress alone determines the
+    strength due to suction and the swelling on wetting.  The suction is evaluated at the end of a substep.  It has no
+    effect once P_c0 has fallen to P_r.
 
     Parameters
     ----------
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: P_c at the suction of the start over that through the initial stress.
+        Overconsolidation ratio, -, >= 1: P_c at the initial suction over the size through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r
         lambda of very dry soil over lambda(0), -, > kappa / lambda_, <= 1.
     beta
-        How fast lambda falls with suction, 1/Pa, >= 0.
+        Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, at which suction changes nothing; a hundredth to a half of P_c0 is usual.
+        Stress P_r, Pa, > 0, at which suction has no effect; usually a hundredth to a half of P_c0.
 
-    The other parameters are those of `ModifiedCamClay`.  In a scene with fluid `retention` must be given.  The state is
-    that of Modified Cam Clay, `consolidated` that of P_c0, and `suction`, Pa.  Alonso, Gens and Josa (1990); in
+    Other parameters: see `ModifiedCamClay`.  In a scene with fluid `retention` must be given.  The state is that of
+    Modified Cam Clay, with `consolidated` for P_c0, and `suction`, Pa.  Source: Alonso, Gens and Josa (1990); in
     Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range, or is not given.
+        A constant out of its range, or missing.
     """
 
     r: Field = None
@@ -300,9 +299,9 @@ class BarcelonaBasic(ModifiedCamClay):
 
 
 class _Return:
-    """The return to the yield surface that an unknown d stands for.
+    """Return to the yield surface for a given d.
 
-    compaction, flow: a and h; steepness: w exp(-d), the square of Q / (M P) at the end; trial_pressure: P_t, Pa; rho:
+    compaction, flow: a and h; steepness: w exp(-d), squared Q / (M P) at the end; trial_pressure: P_t, Pa; rho:
     change of ln P_c over a; yields: whether the trial stress is outside.
     """
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Drucker and Prager's elastoplasticity at finite strain: a law that gives its stress and has a state.
+"""Drucker and Prager's elastoplasticity at finite strain.
 
-Multiplicative, in principal logarithmic strains: the inverse plastic metric C_p^-1 is the state, the trial
-elastic strain is eps = ln(b)/2 with b = F C_p^-1 F^T, elasticity is Hencky's, tau = K tr(eps) I + 2G dev eps,
-and the return to the yield surface
+Plasticity is multiplicative, in principal logarithmic strains.  The state is the inverse plastic metric C_p^-1, and the
+trial elastic strain is eps = ln(b)/2 with b = F C_p^-1 F^T.  Elasticity is Hencky's, tau = K tr(eps) I + 2G dev eps.
+The return to the yield surface
 
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
-is that of small strain, in closed form, to the cone or to its apex (de Souza Neto, Peric and Owen 2008, 8.3 and
-14.6).  All of it is UFL; the consistent tangent is UFL's derivative of the stress.
+has the closed form of small strain, to the cone or to its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).
+The consistent tangent is UFL's derivative of the stress.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""How the cone meets Mohr and Coulomb's pyramid: (eta, xi) from tangent, sine and cosine of the friction angle."""
+"""Match of the cone to Mohr and Coulomb's pyramid: (eta, xi) of tangent, sine and cosine of the friction angle."""
 LEAST = 1e-20
-"""Under the root of the deviatoric strain's square: keeps its derivative finite.
+"""Constant under the root of the squared deviatoric strain, which keeps its derivative finite.
 
 Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02.
 """
@@ -47,26 +47,25 @@ class DruckerPrager(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90).
     dilation
-        Dilation angle psi, degrees, in [0, friction]; equal to the friction angle the flow is associated, and the
-        tangent symmetric.
+        Dilation angle psi, degrees, in [0, friction].  At the friction angle flow is associated, and the tangent is
+        symmetric.
     cohesion
-        Cohesion c_0, Pa, >= 0.  Without any, points without pressure have no stiffness.
+        Cohesion c_0, Pa, >= 0.  With zero, points without pressure have no stiffness.
     hardening
-        Linear hardening H, Pa, >= 0: c = c_0 + H kappa, kappa the accumulated plastic strain (the work conjugate
-        of c in associated flow).
+        Linear hardening H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa (work conjugate to c
+        in associated flow).
     match
-        The cone meets Mohr and Coulomb's surface in "plane strain" (the same collapse load there; for associated
-        flow exactly), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In axisymmetry none
-        is Mohr and Coulomb's at all places: von Mises's circular footing carries a tenth less than Tresca's.
+        The cone meets Mohr and Coulomb's surface in "plane strain" (equal collapse load, exact for associated flow),
+        triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  No cone matches everywhere in
+        axisymmetry: a circular footing on von Mises's soil carries a tenth less than on Tresca's.
 
-    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and
-    `hardened`, kappa, in `points.data`.  De Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
+    Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `hardened`, kappa, in
+    `points.data`.  Source: de Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range, or is not given: friction, dilation and cohesion have no
-        values that are safe to assume.
+        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     hardening: Field = 0.0
@@ -97,7 +96,7 @@ class DruckerPrager(Frictional):
 
     @property
     def eta_flow(self):
-        """Slope of the cone of the plastic potential."""
+        """Slope of the plastic potential."""
         return self._cone(self.dilation)[0]
 
     @staticmethod
@@ -116,13 +115,13 @@ class DruckerPrager(Frictional):
 
 
 def stress(trial: Trial, to: dict, shear):
-    """Return the Kirchhoff stress (3, 3), Pa, of what `returned` gives."""
+    """Return the Kirchhoff stress (3, 3), Pa, from the result of `returned`."""
     return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
 
 
 def metric(trial: Trial, to: dict, bulk, plastic):
-    """Return C_p^-1 (3, 3) at the end of the step of what `returned` gives."""
-    # b = exp(2 eps), the elastic strain now eps = p/(3K) I + ratio dev(trial eps)
+    """Return C_p^-1 (3, 3) at the end of the step from the result of `returned`."""
+    # b = exp(2 eps) with the elastic strain eps = p/(3K) I + ratio dev(trial eps)
     mean, ratio = 2 * to["p"] / (3 * bulk), to["ratio"]
     b = trial.isotropic(lambda e: ufl.exp(mean + ratio * (ufl.ln(e) - 2 * trial.volumetric / 3)))
     back = ufl.inv(trial.F)
@@ -130,12 +129,12 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the stress of a trial elastic strain to the yield surface; drag: viscosity over time, Pa.
+    """Return the trial stress to the yield surface; drag: viscosity over time, Pa.
 
     Returns
     -------
-    p, ratio: pressure and ratio of the deviator to its trial value; yields: whether the trial stress is outside;
-    apex: 1 where it returns to the apex, else 0; hardened: growth of the hardening variable.
+    p, ratio: pressure, Pa, and ratio of the deviator to its trial value; yields: whether the trial stress is outside;
+    apex: 1 for a return to the apex, else 0; hardened: growth of the hardening variable.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)
@@ -143,7 +142,7 @@ def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, 
     f = q + eta * p - strength
     cone = f / (shear + bulk * eta * eta_flow + xi**2 * hardening + drag)
     to_cone = ufl.le(shear * cone, q)
-    slope = xi / (eta + EPSILON)  # no friction has no apex, but every branch must be finite
+    slope = xi / (eta + EPSILON)  # without friction there is no apex, but every branch must be finite
     apex = (p - strength / (eta + EPSILON)) / (bulk + slope**2 * hardening)
     yields = ufl.gt(f, 0)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Laws evaluated at points: stresses and new state at the material points, conductivities at the pieces."""
+"""Evaluation of laws: stresses and new state at the material points, conductivities at the pieces."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class LawAtPoints:
-    """A law evaluated at the material points that follow it.
+    """Evaluation of a law at its material points.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ class LawAtPoints:
     shapes
         Shape of each of its parameters and of its variables of state.
     stretches
-        Number of axes of the deformation gradients that it sees; by default that of the grid.
+        Number of axes of its deformation gradients; by default that of the grid.
     cell_size
-        That laws are given, m; by default that of the grid.
+        Cell size for laws, m; by default the mean cell size of the grid.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class LawAtPoints:
 
     @cached_property
     def points(self) -> FormPoints:
-        """The points, with F and what the law takes."""
+        """Points with F, and with the parameters and state of the law."""
         return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
 
     @cached_property
@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return some of the material points, with values (n, ...) of F and of what the law takes."""
+        """Return some of the material points, with values (n, ...) of F, parameters and state."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         taken = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -107,7 +107,7 @@ class LawAtPoints:
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress of the shape of F (n, d, d), Pa, so long after the state, s."""
+        """Return the effective Cauchy stress (n, d, d), Pa, in the shape of F; dt: time since the state, s."""
         stress = self._stress
         self._solve(data, dt)
         return stress.evaluate(data)
@@ -117,7 +117,7 @@ class LawAtPoints:
         return PointExpression(expression(self.law.energy, [()], "F", F=self._F, **self._values), self.points)
 
     def energy(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stored energy (n,) per reference volume, Pa, of a law that gives it."""
+        """Return the stored energy (n,) per reference volume, Pa, of a law with an energy."""
         energy = self._energy
         self._solve(data, 0.0)
         return energy.evaluate(data)
@@ -128,7 +128,7 @@ class LawAtPoints:
         return None if across is None else PointExpression(across, self.points)
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa; nan across the plane where the law does not know it."""
+        """Return the effective Cauchy stress (n, 3, 3), Pa; nan out of plane if the law does not define it."""
         if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
@@ -138,7 +138,7 @@ class LawAtPoints:
 
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
-        """All components of the new state in one vector, and the shapes of its parts."""
+        """All components of the new state in one vector, and the shapes of the state."""
         what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
         new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return the names and values (n, ...) of the state that follows from the F of the end of a step of dt, s."""
+        """Return names and values (n, ...) of the state at the end of a step of dt, s, from F at the end."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -162,9 +162,9 @@ class LawAtPoints:
 
 
 def knows_space(grid: Grid, m: Skeleton) -> bool:
-    """Return whether a material's law takes F (3, 3) of plane strain; one of the user's may be for the plane only.
+    """Return whether a material's law takes F (3, 3) in plane strain; a user-defined law may be for the plane only.
 
-    m: its constants are arrays over one point.  Laws with local unknowns are taken to.
+    m: material with constants as arrays over one point.  For laws with local unknowns it is assumed.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -174,11 +174,11 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
     given = {name: fem.Constant(grid.mesh, value) for name, value in values.items()}
     given |= {name: fem.Constant(grid.mesh, np.asarray(value, dtype=float)) for name, value in law.state.items()}
     F = ufl.variable(FormPoints(grid, F=(3, 3)).F)
-    log = logging.getLogger("UFL")  # it tells what goes wrong before it raises
+    log = logging.getLogger("UFL")  # it logs errors before it raises
     log.disabled, before = True, log.disabled
     try:
         law_of_F = expression(function, [shape], F=F, **given, **by_scene(grid))
-        apply_derivatives(apply_algebra_lowering(ufl.diff(law_of_F, F)))  # where UFL finds what sizes do not agree
+        apply_derivatives(apply_algebra_lowering(ufl.diff(law_of_F, F)))  # here UFL detects sizes that disagree
     except Exception:  # UFL has several kinds
         return False
     finally:
@@ -189,9 +189,9 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return what the scene gives to laws, see `BY_SCENE`, as UFL constants; the time is to be set.
+    """Return the arguments `BY_SCENE` of laws as UFL constants; the time must be set.
 
-    points: of a law; in cells of many sizes they carry that of theirs.
+    points: of the law; with cells of several sizes they carry their own cell size.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -201,27 +201,28 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the mean length of a cell, of many sizes the largest one, m: that of a square or cube of its size."""
+    """Return the edge of a square or cube as large as a cell, m; with several sizes of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
 
 MOST = 100.0
-"""The most by which a skeleton counts as softer than elastic: perfectly plastic flow has no stiffness at all.
+"""Upper limit of the softness; perfectly plastic flow has no stiffness.
 
 Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02.
 """
 
 
 class SoftnessAtPoints:
-    """By how much material points that yield are softer in shear than elastic, along the strain of the last step.
+    """Softness of yielding points: elastic over tangent shear modulus, along the strain of the last step.
 
-    What alternates from cell to cell in the volume changes grows with the strain; the pressures that balance it are
-    this over the strength tau of their damping, 1/Pa, that of the elastic moduli.  Where soil flows the strain grows
-    and the stress does not: tau must be that of the tangent, else pressures alternate by as much as the soil is strong.
-    With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent's shear
-    modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  It is that of the step before: one of the present iterate
-    would keep Newton's method from converging, or make the answer depend on its way.
+    Volume changes that alternate from cell to cell grow with the strain.  The balancing pressures are these volume
+    changes over the damping strength tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau must then
+    follow the tangent; otherwise the alternating pressures reach the strength of the soil.
+
+    With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent shear modulus
+    is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  It is taken from the step before.  A value from the present iterate
+    would prevent convergence of Newton's method, or make the result depend on the iterates.
 
     Parameters
     ----------
@@ -252,7 +253,7 @@ class SoftnessAtPoints:
     def __call__(
         self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64], dt: float
     ) -> NDArray[np.float64]:
-        """Return the softness (n,) of points with F and what the law takes, in [1, MOST].
+        """Return the softness (n,) of points with F, parameters and state, in [1, MOST].
 
         dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa; dt: length of the step, s.
         """
@@ -269,16 +270,16 @@ class SoftnessAtPoints:
 
 
 class ConductivityAtPieces:
-    """Conductivities that depend on deformation and place, evaluated at the pieces.
+    """Conductivities that depend on deformation and position, evaluated at the pieces.
 
     Parameters
     ----------
     materials
         The scene's materials.
     laws
-        Their different conductivity laws.
+        Distinct conductivity laws of the materials.
     pieces
-        Points with the fields F, position, conductivity and porosity0, where a material has a conductivity law.
+        Points with the fields F, position, conductivity and porosity0, if a material has a conductivity law.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -297,7 +298,7 @@ class ConductivityAtPieces:
         self._materials = materials
         self._u = displacement
         self.by_pressure = any("p" in signature(law).parameters for law in laws)
-        """Whether a law names p."""
+        """Whether a law takes p."""
         self._p = pressure
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 
@@ -322,7 +323,7 @@ class ConductivityAtPieces:
         Raises
         ------
         ValueError, NotConverged
-            A law gives what is no conductivity: the first when a step begins, the other at an iterate.
+            A conductivity is negative or not finite: the first at the start of a step, the second at an iterate.
         """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():
@@ -338,7 +339,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities that a law gives in three states, which tell it from another law."""
+    """Return the conductivities of a law in three states, as its fingerprint."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])
@@ -347,7 +348,7 @@ def sampled(law: Callable) -> list[float | None]:
         try:
             k = expression(law, [()], F=F, x=ufl.as_vector([0.25, 0.75]), **given)
             out.append(float(apply_algebra_lowering(k)(())))
-        except Exception:  # a law need not know numbers, nor these
+        except Exception:  # a law need not accept numbers
             out.append(None)
     drains = getattr(law, "specific_yield", 0.0)
     return out + [drains] * (drains > 0)

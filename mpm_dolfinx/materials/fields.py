@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The materials of a scene at its points: parameters that differ from place to place, state, several laws."""
+"""Materials of a scene at its points: parameters as functions of position, state, several laws."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
     "pores".split()
 )
-"""Names of what points of integration carry beside parameters and state."""
+"""Reserved names of quadrature point data, not available for parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""By how much the state of a law differs from that at rest where it counts as another.
+"""Change of the state from rest at which a point counts as yielded.
 
 Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02.
 """
 STIFFEST = 100.0
-"""How much stiffer than the skeleton pore fluid that cannot flow is taken to be, at most: rounding grows with it.
+"""Upper limit of the stiffness of trapped pore fluid, in moduli of the skeleton; it limits rounding errors.
 
 Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02.
 """
 
 
 class SceneMaterials:
-    """The materials of a scene; what differs from point to point is put into `points.data`, and found there.
+    """Materials of a scene; values that vary from point to point are stored in `points.data`.
 
     Parameters
     ----------
     grid
         Background grid.
     materials
-        Material of each index that the bodies name.
+        Materials, in the order of the indices of bodies.
     bodies
-        All bodies; their reference positions are where fields are evaluated.
+        All bodies; fields are evaluated at their reference positions.
     points
         The points of this process, as seeded.
     fluid
@@ -76,14 +76,14 @@ class SceneMaterials:
         self.grid = grid
         self.fluid = fluid
         seeded: dict[str, NDArray[np.float64]] = dict(points.data)
-        self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
+        self._used = _used(bodies, len(materials))  # a material without a body has no effect
         evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
         locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
         asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
         each = zip(self._used, evaluated, asked, strict=True)
         known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
-        """Number of axes of the deformation gradients that laws see."""
+        """Number of axes of the deformation gradients of laws."""
         if self.across:
             seeded[ACROSS] = np.ones(len(points))
         if prestressed:
@@ -95,7 +95,7 @@ class SceneMaterials:
         self._fields = [_by_place(m) for m in materials]
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
-        """The different conductivity laws of the scene."""
+        """Distinct conductivity laws of the scene."""
         kinds = list(zip(map(type, used), locks, known, strict=True))
         self._parts = list(dict.fromkeys(kinds))
         own = dict(zip(self._used, kinds, strict=True))
@@ -115,13 +115,13 @@ class SceneMaterials:
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
         self.layered = self.layered or len({m.retention for m in used}) > 1
-        """Whether points may differ in what they conduct."""
+        """Whether the conductivity may vary from point to point."""
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """What tells fields and laws of flow from others."""
+        """Fingerprints of fields and of laws of flow, for checkpoints."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -151,7 +151,7 @@ class SceneMaterials:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
                     self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
-        """The points with what they carry at the start: parameters that differ from place to place, state."""
+        """The points with their initial data: parameters as functions of position, and state."""
         self._at_points = [
             LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
             for law in self.laws
@@ -159,15 +159,15 @@ class SceneMaterials:
 
     @property
     def across(self) -> bool:
-        """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
+        """Whether laws take a stretch out of plane in plane strain, from the mean dilatation."""
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
-        """Return the number of axes of the deformation gradients that a law sees."""
+        """Return the number of axes of a law's deformation gradients."""
         return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
-        """Note the shapes of what a material's law takes, and seed the state of so many points."""
+        """Add the shapes of a law's parameters and state, and seed the state of `count` points."""
         law = type(m)
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
@@ -183,9 +183,9 @@ class SceneMaterials:
             _known(f"{law.__name__}: unknown {name!r}", value)
         m.check_cells(mean_size(self.grid))
         if "suction" in law.state and self.fluid is not None and m.retention is None:
-            raise ValueError(f"{law.__name__}: retention = None, must be a law of retention beside suction")
+            raise ValueError(f"{law.__name__}: retention = None, must be a retention curve for a law with suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
-            what = "has unknowns and takes cell_size, must not on a grid of cells of many sizes"
+            what = "has unknowns and takes cell_size, must not with cells of several sizes"
             raise ValueError(f"{law.__name__}: {what}")
         for name in law.parameters:
             if not hasattr(m, name):
@@ -206,10 +206,10 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return each law with points for the pieces that follow it, and whether Q1 cells would lock with these.
+        """Return each law with points for its pieces, and whether Q1 cells would lock.
 
-        Materials of one law of which some lock and others do not are two parts; a single part's points are all
-        `pieces`, those of several have the fields `common` of the pieces and what their law takes.
+        If some materials of a law lock and others do not, the law has two parts.  A single part uses `pieces` itself.
+        With several parts the points have the fields `common`, and parameters and state of their law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -234,17 +234,17 @@ class SceneMaterials:
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) laws see a stretch across the plane."""
+        """Return at which points (n,) laws take a stretch out of plane from the mean dilatation."""
         return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) laws know a stretch across the plane."""
+        """Return at which points (n,) laws accept a stretch out of plane."""
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
+        """Return rows (n, 2) that are equal for points of equal conductivity: conductivity, m/s, and number of the law.
 
-        By a law of the place none does.  The fraction of that number tells laws of retention.
+        With a law of position all rows differ.  The fractional part of the number distinguishes retention curves.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -256,7 +256,7 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's law of retention (n,), from 1; 0 where pores stay full."""
+        """Return the number of each point's retention curve (n,), from 1; 0 if pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
@@ -267,7 +267,7 @@ class SceneMaterials:
 
     @cached_property
     def retentions(self) -> Retentions | None:
-        """Laws of retention, if there are any."""
+        """Retention curves of the scene, or None."""
         laws = list(dict.fromkeys(self.materials[i].retention for i in self._used))
         some = [law for law in laws if law is not None]
         return Retentions(some, None not in laws, self.grid) if some and self.fluid is not None else None
@@ -277,28 +277,27 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the same of rows (m, width) of points: see `SaturationAt`."""
+        """Return S, its slope, 1/Pa, chi and k_r at pressures (m,), Pa, for rows (m, width): see `SaturationAt`."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the suction about which pores of the points drain (n,), Pa; infinite where they stay full."""
+        """Return the suction at which pores of the points drain (n,), Pa; infinite if they stay saturated."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
     def felt(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the pore pressures that stresses contain at the points (n,), Pa: alpha chi p."""
+        """Return the part of the pore pressure in total stresses at the points (n,), Pa: alpha chi p."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
     def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return what points (n, width) carry of their laws of retention."""
+        """Return the rows (n, width) of the points' retention curves, see `Retentions`."""
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
 
-        Of a material whose constants are the same everywhere it is one value (...) without columns, else one a point; a
-        single number always stands for all.
+        `value` returns one value a point or a single number; for a uniform material without columns also one (...).
         """
         each = []
         for i in self._used:
@@ -311,12 +310,12 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return points, some of whose data have been named anew, with what follows from the materials' fields.
+        """Return points with updated derived fields after a change of the `named` fields.
 
         Raises
         ------
         ValueError
-            Fields have values that they may not have.
+            Fields out of their range.
         """
         data = dict(points.data)
         for i in self._used:
@@ -333,12 +332,12 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material whose constants are arrays over some of its points, unless they are numbers anyway."""
+        """Return a material with constants as arrays over some of its points; uniform materials remain unchanged."""
         values = {name: points.data[name][rows] for name in self._fields[i]}
         return _spread(self.materials[i], values, len(rows)) if values else self.materials[i]
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return all parameters at the points (n, ...), zero where a point's law does not know them."""
+        """Return all parameters at the points (n, ...); zero if a point's law does not have them."""
         out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
         for i in self._used:
             rows = np.flatnonzero(points.material == i)
@@ -349,12 +348,12 @@ class SceneMaterials:
 
     @property
     def constants(self) -> dict[str, Skeleton]:
-        """Names of the constants of materials, each with a material that has it."""
+        """Names of material constants, each with a material that has it."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @property
     def field_names(self) -> list[str]:
-        """Names of the constants of materials that differ from place to place."""
+        """Names of material constants that are functions of position."""
         return list(dict.fromkeys(name for i in self._used for name in self._fields[i]))
 
     @property
@@ -364,7 +363,7 @@ class SceneMaterials:
 
     @property
     def state_names(self) -> list[str]:
-        """Names of what evolves with a law."""
+        """Names of the laws' state variables."""
         return list(dict.fromkeys(name for law in self.laws for name in law.state))
 
     def porosity(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -376,7 +375,7 @@ class SceneMaterials:
         return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
 
     def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the storage coefficient that the points would have at a porosity of one (n,), 1/Pa."""
+        """Return the storage coefficient at a porosity of one (n,), 1/Pa."""
         return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
 
     @property
@@ -385,7 +384,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the specific yield at the points, and the suction, Pa, at which it has drained (n, 2)."""
+        """Return the specific yield at the points, and the suction, Pa, for its full drainage (n, 2)."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -393,12 +392,12 @@ class SceneMaterials:
         )
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil and pore fluid at the points (n,), kg/m^3, were all pores full."""
+        """Return the density of soil with saturated pores at the points (n,), kg/m^3."""
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
     def present_density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil and of the water that its pores hold at the points (n,), kg/m^3."""
+        """Return the density of soil and its pore water at the points (n,), kg/m^3."""
         density = self.density(points)
         if self.retentions is None:
             return density
@@ -406,9 +405,9 @@ class SceneMaterials:
         return density - empty * self.porosity(points) * self.fluid.density
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
+        """Return the undrained confined modulus (n,), Pa: lambda + 2G + alpha^2 / S.
 
-        At most so many times lambda + 2G as `STIFFEST` says.
+        The last term is at most `STIFFEST` (lambda + 2G).
         """
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
@@ -421,7 +420,7 @@ class SceneMaterials:
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) the state of a law is no longer that at rest."""
+        """Return at which points (n,) the state of a law has changed from rest."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = np.flatnonzero(law_of == number)
@@ -454,7 +453,7 @@ class SceneMaterials:
         return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
 
     def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) soil has yielded whose plastic flow changes the volume."""
+        """Return at which points (n,) soil has yielded with dilatant flow."""
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -468,7 +467,7 @@ class SceneMaterials:
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa, also across the plane; on all processes together."""
+        """Return the effective Cauchy stress (n, 3, 3), Pa, also out of plane; on all processes together."""
         out = np.zeros((len(points), 3, 3))
         for law, rows, data in self._placed(points):
             out[rows] = law.stress_3d(data)
@@ -477,7 +476,7 @@ class SceneMaterials:
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the elastic energy of the skeleton (n,) per reference volume, Pa; on all processes together.
 
-        Of laws that give stresses it is that of Hencky's law, of constant moduli, where they say so, else none.
+        For laws without an energy it is Hencky's energy with constant moduli if `elastic_hencky`, else zero.
         """
         out = np.zeros(len(points))
         bulk, shear = (self.table(points, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
@@ -498,7 +497,7 @@ class SceneMaterials:
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return what the points, with the F of the end of a step of dt, s, carry from then on; before: at its start.
+        """Return the point data after a step of dt, s, for points with F at its end; before: points at its start.
 
         Raises
         ------
@@ -529,7 +528,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return every law with the indices and the data of the points that follow it."""
+        """Return every law with the indices and the data of its points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
@@ -537,7 +536,7 @@ class SceneMaterials:
 
 
 def _known(name: str, value) -> NDArray[np.float64]:
-    """Return what a law takes as an array; it may be infinite, but not nan."""
+    """Return a parameter or state of a law as an array; infinity is allowed, nan is not."""
     out = numbers(name, value, None, allowed="numbers", test=np.isreal)
     if np.isnan(out).any():
         raise ValueError(f"{name} = nan, must be numbers")
@@ -554,12 +553,12 @@ def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _takes(law: type[Skeleton]) -> list[str]:
-    """Return the names of the parameters and of the state that a law takes."""
+    """Return the names of a law's parameters and state."""
     return [*law.parameters, *law.state]
 
 
 def _used(bodies: Sequence[Body], count: int) -> list[int]:
-    """Return the indices of the materials, of so many, that bodies are of, ascending."""
+    """Return the indices of the bodies' materials, ascending; count: number of materials."""
     for body in bodies:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
@@ -567,12 +566,12 @@ def _used(bodies: Sequence[Body], count: int) -> list[int]:
 
 
 def _by_place(m: Skeleton) -> list[str]:
-    """Return the names of a material's fields that are functions of places."""
+    """Return the names of a material's constants that are functions of position."""
     return [name for name in constants_of(m) if callable(getattr(m, name))]
 
 
 def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
-    """Return a material with its fields evaluated at the places of all its points, see `_places`."""
+    """Return a material with its constants evaluated at all its points, see `_places`."""
     return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
 
 
@@ -587,7 +586,7 @@ def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
 
 
 def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return which of some points are of a material (m,), and their rows among all that are, see `_places`."""
+    """Return the indices (m,) of points with a material, and their rows among all its points, see `_places`."""
     here = []
     rows = []
     start = 0

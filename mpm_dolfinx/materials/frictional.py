@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the laws of frictional soil have in common: angles of friction and dilation, cohesion."""
+"""Common parameters of frictional soil: angles of friction and dilation, cohesion."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ GIVEN = {
     "dilation": "in [0, friction] degrees; 0 for flow without a change of volume, friction for associated flow",
     "cohesion": ">= 0 Pa",
 }
-"""Constants that must be given, and what they may be."""
+"""Required constants and their ranges."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frictional(Skeleton):
-    """Elastic, perfectly plastic or hardening soil with friction; laws derive from it.
+    """Elastic, perfectly plastic or hardening soil with friction: base of such laws.
 
     Parameters
     ----------
@@ -30,12 +30,12 @@ class Frictional(Skeleton):
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range, or is not given.
+        A constant out of its range, or missing.
     """
 
     dilates: ClassVar = True
 
-    friction: Field = None  # given always: without it a message says what it may be
+    friction: Field = None  # required: if missing, a message states its range
     dilation: Field = None
     cohesion: Field = None
 
@@ -53,4 +53,4 @@ class Frictional(Skeleton):
 
     @property
     def nearly_incompressible(self) -> bool:
-        return True  # plastic flow is
+        return True  # plastic flow may be isochoric

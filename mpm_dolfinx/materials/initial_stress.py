@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Effective stresses of soil as seeded, given or by the weight above, and the elastic strains that go with them."""
+"""Initial effective stresses, prescribed or from the overburden, and the corresponding elastic strains."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
-EXACT, CLOSE = 1e-13, SAME  # of the largest given stress: to which laws are solved, and have to be
+EXACT, CLOSE = 1e-13, SAME  # over the largest initial stress: accuracy aimed at, and required
 MOST = 30  # iterations
 LARGEST = 0.2  # change of a strain in an iteration
 
@@ -33,16 +33,16 @@ LARGEST = 0.2  # change of a strain in an iteration
 class K0:
     """Initial effective stress of soil at rest under its own weight.
 
-    The vertical one is the weight above, soil and fluid, and the surcharge, less biot times the pore pressure; the
-    horizontal ones, in axisymmetry along radius and hoops, are K0 times that.  Exact where ground and layers are
-    level; elsewhere a start for the balance.
+    The vertical stress is the overburden of soil and fluid plus the surcharge, less biot times the pore pressure.  The
+    horizontal stresses, radial and circumferential in axisymmetry, are K0 times that.  They are exact for level ground
+    and layers; otherwise they are the starting point of an equilibrium step.
 
     Parameters
     ----------
     ratio
         K0, >= 0: a number, or a function of the reference positions X (n, d), m.
     surcharge : number or callable x (n, d) -> (n,), Pa
-        What acts on the surface, >= 0, at places x on it, as for still water above it.
+        Pressure on the surface, >= 0, at positions x on it, for example of still water above.
     """
 
     ratio: Field
@@ -58,7 +58,7 @@ class K0:
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return ratio or surcharge at places (n, d), m: one or (n,)."""
+        """Return ratio or surcharge at positions (n, d), m: one value or (n,)."""
         value = getattr(self, name)
         given = at_places(f"K0: {name}", "one value a place", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
@@ -68,17 +68,17 @@ InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
 
 
 def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
-    """Return the pore pressure at rest of a phreatic level, as the scene's `pressure`: a function of places x (n, d).
+    """Return the hydrostatic pressure below a phreatic level, a function of positions x (n, d) for `pressure`.
 
-    Pores are full above it too, and hold their water by suction: the pressure there is negative.
+    The pressure above the level is negative: suction.
 
     Parameters
     ----------
     level
         Height, m, along the last axis.
     unit_weight
-        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside of a scene 9810.  A warning says where
-        it differs from the fluid's.
+        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside a scene 9810.  A warning appears if it
+        differs from that of the scene's fluid.
     """
     numbers("hydrostatic: level", level)
     if unit_weight is not None:
@@ -89,7 +89,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A pressure of water: its unit weight, N/m^3, where none is given that of the scene's fluid, else 9810."""
+    """A water pressure with a unit weight, N/m^3; by default that of the scene's fluid, outside a scene 9810."""
 
     @property
     def unit_weight(self) -> float:
@@ -99,18 +99,18 @@ class OfWater:
 
 @dataclass(frozen=True)
 class Hydrostatic(OfWater):
-    """The pressure of water at rest below a level, as a function of places."""
+    """Hydrostatic pressure below a level, as a function of position."""
 
     level: float
     given: float | None = None
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at places x (m, d)."""
+        """Return the pressures (m,), Pa, at positions x (m, d), m."""
         return self.unit_weight * (self.level - x[:, -1])
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
-    """Return the initial stress of each body that has one; one for all is that of the bodies that are there."""
+    """Return the initial stress of each body; a single one holds for all bodies present at the start."""
     allowed = "a K0, a function of x, or one of these for each of some bodies, {index: ...}"
     if given is None:
         return {}
@@ -123,7 +123,7 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 
 
 class InitialStresses:
-    """The stresses that bodies of a scene have as seeded.
+    """Initial stresses of the bodies of a scene.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class InitialStresses:
     given
         See `by_body`.
     pressure
-        Pore pressure as seeded, Pa, a number or a function of places.
+        Initial pore pressure, Pa, a number or a function of position.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
@@ -142,12 +142,12 @@ class InitialStresses:
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
-        """Return points whose elastic strain is that of the stress given; on all processes together.
+        """Return points with the elastic strains of their initial stress; on all processes together.
 
         Parameters
         ----------
         present
-            Which bodies lie on one another, as seeded.
+            Which bodies are present, for the overburden.
         gravity : (d,), m/s^2
             None without.
         """
@@ -194,7 +194,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return weight above, Pa, height of the surface, m, and biot times pressure, Pa, of points, where asked."""
+        """Return overburden, Pa, height of the surface, m, and biot times pressure, Pa, of points, for K0."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -217,14 +217,14 @@ class InitialStresses:
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return points of which the chosen ones (n,) have target stresses (n, 3, 3), Pa; on all processes together.
+    """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); on all processes together.
 
-    Modified Cam Clay has the stress among its constants; other laws have elastic strains with it, see `_Sought`.
+    In Modified Cam Clay the stress is a constant of the material; other laws get elastic strains, see `_Sought`.
 
     Raises
     ------
     ValueError
-        Naming the first place where a law cannot bear its stress.
+        A stress is outside the yield surface; the message names the first such position.
     """
     comm = materials.grid.comm
     rows = np.flatnonzero(chosen)
@@ -251,10 +251,10 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _Sought:
-    """Elastic strains that give target stresses, by Newton's method.
+    """Elastic strains for target stresses, by Newton's method.
 
-    They are symmetric: of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic :
-    (n,) which have the stress among their constants, and which have C_p^-1.
+    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa;
+    given, plastic : (n,) which points have the stress as a constant, and which have C_p^-1.
     """
 
     materials: SceneMaterials
@@ -270,13 +270,13 @@ class _Sought:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Which components (n, k) are sought."""
+        """Which components (n, k) are unknown."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
         out[:, 2] &= self.materials.knows_across(self.points)
         return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the components (n, k) of tensors (n, 3, 3) that are sought, the others zero."""
+        """Return the unknown components (n, k) of tensors (n, 3, 3); other components are zero."""
         i, j = np.array(self.components).T
         return np.where(self.free, tensor[:, i, j], 0.0)
 
@@ -296,7 +296,7 @@ class _Sought:
         return self.of(elastic)
 
     def off(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
-        """Return points with elastic strains (n, k), and what is missing of their target, Pa (n, k)."""
+        """Return points with elastic strains (n, k), and their stresses minus the target, Pa (n, k)."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
@@ -309,7 +309,7 @@ class _Sought:
         return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the strains (n, k) after a step from those with which so much is missing, by differences."""
+        """Return the strains (n, k) after a Newton step; missing: stress minus target, Pa.  Slopes are differences."""
         count = strain.shape[1]
         free = self.free
         (_, shear) = self.moduli()
@@ -324,10 +324,10 @@ class _Sought:
         return np.clip(strain - change, -1, 1)
 
     def found(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return points with the strains, and which (n,) do not have the target."""
+        """Return points with the strains, and which points (n,) miss the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
-        close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # of strains that are near none
+        close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # round-off for very small strains
         now = self.points
         bad = np.ones(len(strain), dtype=bool)
         try:
@@ -344,7 +344,7 @@ class _Sought:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return points with the elastic strains of others, to which these have been deformed from where they are."""
+    """Return points, not moved, with the elastic strains of `moved`, their deformed copies."""
     F = moved.F_of_laws
     d = F.shape[1]
     law = materials.law_of(points)
@@ -365,7 +365,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
 
 
 def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
-    """Return points of which the chosen ones (n,) carry other values (n, ...), if they carry any of this name."""
+    """Return points with new values (n, ...) at the chosen ones (n,), for names that the points have."""
     data = dict(points.data)
     for name, new in values.items():
         if name in data and chosen.any():
@@ -383,16 +383,16 @@ def _prestretch(m) -> NDArray[np.float64]:
 
 
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
-    """Return what is wrong with stresses (n, 3, 3) as constants of Modified Cam Clay."""
+    """Return an error message for stresses (n, 3, 3) that cannot be constants of Modified Cam Clay, or an empty one."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
     bad = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
-    what = "must be without shear, of compressive mean, for ModifiedCamClay"
+    what = "must have no shear and a compressive mean for ModifiedCamClay"
     return "".join(f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, {what}" for i in np.flatnonzero(bad)[:1])
 
 
 def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
     name = materials.laws[law[i]].__name__
-    allowed = f"what {name} can bear: inside its yield surface"
-    tension = np.trace(target[i]) > 0  # pores press by more than the weight above
-    more = "; of open water above it K0 takes the weight as surcharge" if tension and points.pressure[i] > 0 else ""
+    allowed = f"inside the yield surface of {name}"
+    tension = np.trace(target[i]) > 0  # the pore pressure exceeds the overburden
+    more = "; K0 needs the weight of open water as surcharge" if tension and points.pressure[i] > 0 else ""
     return f"initial_stress at {points.x[i] + materials.grid.base}: {target[i].tolist()} Pa, must be {allowed}{more}"

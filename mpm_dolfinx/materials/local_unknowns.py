@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Local unknowns: what a law's stress depends on beside F, and what equations at each point determine.
+"""Local unknowns of laws, determined by equations at each point.
 
-A law names unknowns y, trial values z(F) and residuals f(y, z); f = 0 is solved by Newton's method at all points at
-once, to round-off.  The forms see
+A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points at once, to
+round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-whose value is y* and whose derivative by F is that of the solution: UFL's derivative of a stress that is a function of
-y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.  Where a
-stress is evaluated and not differentiated it is that of y*, and there is no Y.  The stress of a law with an energy is
-itself a derivative: there y has a term of second order, whose coefficients follow from f = 0 once more.  A law may also
-give y(z) and its derivative in numpy.
+with the value y* and the derivative of the solution by F.  UFL's derivative of a stress in y and F is then the
+consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  A stress without a
+derivative uses y* alone.  The stress of a law with an energy is itself a derivative.  There y has a second-order term,
+and its coefficients also follow from f = 0.  A law may instead return y(z) and its derivative in numpy.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
 
 
 class Solved(NamedTuple):
-    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k); what gives the derivatives."""
+    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k); function for derivatives."""
 
     key: object
     unknowns: NDArray[np.float64]
@@ -46,7 +45,7 @@ class Solved(NamedTuple):
 
 
 class Derived(NamedTuple):
-    """Derivatives by the trial values: slopes Y (n, m k), and of an energy's unknowns bends (n, m k k)."""
+    """Derivatives by the trial values: first, slopes Y (n, m k); for a law with an energy second, bends (n, m k k)."""
 
     slopes: NDArray[np.float64]
     bends: NDArray[np.float64] | None = None
@@ -60,25 +59,25 @@ class LocalUnknowns:
     law
         Class of the law.
     points
-        The points, which carry what the law takes.
+        The points, with the law's parameters and state.
     F
-        Deformation gradient (d, d) that the law sees, as UFL.
+        Deformation gradient (d, d) of the law, as UFL.
     values
-        UFL values of the law's parameters and state, and the constants that the scene gives to laws.
+        UFL values of the law's parameters and state, and of the scene's constants `BY_SCENE`.
 
     Attributes
     ----------
     values
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
-        The same for what is not differentiated by F: kernels do not compute trial values there.  Stresses that are
-        derivatives of an energy are.
+        The unknowns and `trial` for expressions without a derivative by F; kernels then skip the trial values.  For a
+        law with an energy the same as `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
         self._law, self._comm = law, points.grid.comm
         trial = call(law.trial, F=F, **values) if law.trial is not None else {"F": F}
-        instance(f"{law.__name__}.trial: what it gives", trial, dict)
+        instance(f"{law.__name__}.trial: its result", trial, dict)
         given = {"trial": trial}
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
         if not trial:
@@ -99,7 +98,7 @@ class LocalUnknowns:
         # component by component: in 3D products of tensors take ten times as long to compile
         off = [z[j] - at["trial"][j] for j in range(k)]
         y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
-        if bends:  # in the tangent is the second derivative of the unknowns by F
+        if bends:  # the tangent contains the second derivative of the unknowns by F
             for i, (j, l) in product(range(m), combinations_with_replacement(range(k), 2)):
                 y[i] += at["bends"][i, k * j + l] * off[j] * off[l] / (2 if j == l else 1)
         shapes = {name: np.shape(start) for name, start in law.unknowns.items()}
@@ -109,12 +108,12 @@ class LocalUnknowns:
     def update(self, data: PointData, derive: bool = True) -> None:
         """Solve for the unknowns of points at their present F, and derive them; all processes together.
 
-        derive: whether what is evaluated next depends on `values`, not on `known` alone.
+        derive: whether the next expression depends on `values`, not on `known` alone.
 
         Raises
         ------
         NotConverged
-            Naming the first point where the equations could not be solved.
+            No solution; the message names the first such point.
         """
         trial = self._trial.evaluate(data)
         self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
@@ -122,7 +121,7 @@ class LocalUnknowns:
             self.derive(data)
 
     def derive(self, data: PointData) -> None:
-        """Derive the unknowns of points where they were solved last by F; all processes together."""
+        """Derive the last solution of the unknowns by F; all processes together."""
         solved = self._at(data)
         self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
 
@@ -143,7 +142,7 @@ class LocalUnknowns:
 
 
 class _Equations:
-    """The equations f(y, z) = 0 of a law at points that carry what they take."""
+    """The equations f(y, z) = 0 of a law at points with their arguments."""
 
     def __init__(
         self,
@@ -185,7 +184,7 @@ class _Equations:
             self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
-        """Return trial values as the law's equations name them."""
+        """Return trial values under the argument names of the law's equations."""
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
@@ -221,15 +220,15 @@ class _Equations:
         return Solved(data.key, y, trial, derive)
 
     def _refuse(self, data: PointData, lost: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged, naming the first point that is lost on any process; all of them together."""
+        """Raise NotConverged if a point on any process is lost, with the first such point; all processes together."""
         shown = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in lost[:1]]
         if message := first(self._grid.comm, "".join(shown)):
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution of a law that gives it in numpy."""
+        """Return the solution of a law with `solution` in numpy."""
         n, k, values, start = *trial.shape, {}, 0
-        for name, shape in self._trial.items():  # copies: what a law does to its arguments stays with it
+        for name, shape in self._trial.items():  # copies, because a law may change its arguments
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
             start += _size(shape)
         given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape).copy() for name in self._names}
@@ -250,7 +249,7 @@ class _Equations:
         return Solved(data.key, y, trial, derive)
 
     def _together(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
-        """Return arrays side by side; what one process refuses with a ValueError, all do."""
+        """Return arrays side by side; a ValueError on one process is raised on all."""
         made, refused = [], ""
         try:
             made = make()
@@ -265,14 +264,14 @@ class _Equations:
         return f"{self._law.__name__}.solution"
 
     def _checked(self, found, n: int) -> dict:
-        """Return what a law in numpy gives at n points, unknowns and derivatives as arrays of real numbers.
+        """Return the checked result of a law in numpy at n points: unknowns and derivatives as real arrays.
 
         Raises
         ------
         ValueError
-            It is no pairs by the names of the unknowns, of these shapes; a derivative is by what is no trial value.
+            The result is no dict of pairs with the unknowns' names and shapes, or has a derivative by another name.
         """
-        instance(f"{self._said}: what it gives", found, dict)
+        instance(f"{self._said}: its result", found, dict)
         for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
                 allowed = "must be a pair: values, and a dict of derivatives"
@@ -298,7 +297,7 @@ class _Equations:
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the slopes (n, m, k) of one unknown; given: its derivatives, by some trial values."""
+        """Return the slopes (n, m, k) of one unknown; given: its derivatives by some of the trial values."""
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
             slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))
@@ -312,7 +311,7 @@ def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return real numbers of a shape; others are refused with a ValueError."""
+    """Return real numbers of a shape, or raise ValueError."""
     try:
         value = np.asarray(value)
     except ValueError as error:  # rows of different lengths
@@ -325,9 +324,9 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Solve f(y) = 0 at all points, in place: Newton's method with a line search; return the points where it fails.
+    """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return the failed points.
 
-    system: called with rows (r,) and values (r, m), sets these and returns f (r, m), df/dy (r, m, m) and norms (r,).
+    system: takes rows (r,) and values (r, m), sets these, and returns f (r, m), df/dy (r, m, m) and norms (r,).
     """
     rows, lost = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
@@ -338,7 +337,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         step[solved & lost[rows]] = 0.0  # a solution, though it may be one of many
         lost[rows] &= ~solved
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
-        y[rows] = begun - step  # of those that are close this is the solution
+        y[rows] = begun - step  # for close points this is the solution
         on = ~(close | lost[rows])
         rows = rows[on]
         step = step[on]
@@ -363,7 +362,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A^-1 b (n, m, k) of matrices (n, m, m); not finite where there is none."""
+    """Return A^-1 b (n, m, k) of matrices (n, m, m); not finite for a singular matrix."""
     with np.errstate(all="ignore"):
         if A.shape[1] == 1:
             return b / A
@@ -388,7 +387,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors of given shapes that a UFL vector holds one after the other."""
+    """Return the tensors of given shapes that are consecutive in a UFL vector."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)
@@ -402,4 +401,4 @@ def _nested(vector, index: NDArray[np.int64]):
 
 
 def _given(data: PointData) -> NDArray[np.float64]:
-    raise RuntimeError("trial values and unknowns are given with each evaluation")
+    raise RuntimeError("trial values and unknowns must be passed to each evaluation")

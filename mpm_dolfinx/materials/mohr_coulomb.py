@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Mohr and Coulomb's elastoplasticity at finite strain, with edges, apex and a tension cut-off.
 
-Multiplicative, in principal logarithmic strains, as Drucker and Prager's law, with Hencky's elasticity.  With principal
-Kirchhoff stresses t_1 >= t_2 >= t_3, tension positive,
+Plasticity is multiplicative, in principal logarithmic strains, with Hencky's elasticity.  For principal Kirchhoff
+stresses t_1 >= t_2 >= t_3, tension positive,
 
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
-flow along (1 + sin psi) e_i - (1 - sin psi) e_j and along e_i.  The return keeps the order of the principal values, so
-that it ends on one of eleven faces, edges and vertices (de Souza Neto, Peric and Owen 2008, 8.2, without the
-cut-off).  On each the stress is a linear function of the trial stress.  The end is the one that offends least against:
-the stress is admissible, the order is kept, and all plastic multipliers are >= 0; for one of them that is nothing but
-round-off. All of this is numpy, with exact derivatives also where principal values are equal, as they are on the
-edges.
+flow is along (1 + sin psi) e_i - (1 - sin psi) e_j and along e_i.  The return keeps the order of the principal values,
+so it ends on one of eleven faces, edges and vertices (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).
+On each of them the stress is linear in the trial stress.  An end is valid if the stress is admissible, the order is
+kept, and all plastic multipliers are >= 0.  The end with the least violation is taken; its violation is round-off.
+The computation is in numpy, with exact derivatives also for equal principal values, as on the edges.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
-NEVER = 1e6  # tensile strength over the bulk modulus where none is given
+NEVER = 1e6  # default tensile strength over the bulk modulus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,22 +40,21 @@ class MohrCoulomb(Frictional):
     Parameters
     ----------
     friction
-        Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, of the undrained strength `cohesion`.
+        Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, with the undrained strength `cohesion`.
     dilation
-        Dilation angle psi, degrees, in [0, friction]; equal to the friction angle the flow is associated, and the
-        tangent symmetric.  At the apex soil that is torn apart dilates in any case.
+        Dilation angle psi, degrees, in [0, friction].  At the friction angle flow is associated, and the tangent is
+        symmetric.  Soil torn apart at the apex dilates for any angle.
     cohesion
-        Cohesion c, Pa, >= 0.  Without any, points without pressure have no stiffness.
+        Cohesion c, Pa, >= 0.  With zero, points without pressure have no stiffness.
     tension
-        Tensile strength T, Pa, >= 0: no principal stress is above it.  By default that of the apex, c cot phi.
+        Tensile strength T, Pa, >= 0, an upper limit of the principal stresses.  By default the apex, c cot phi.
 
-    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
+    Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range, or is not given: friction, dilation and cohesion have no
-        values that are safe to assume.
+        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     tension: Field = np.inf
@@ -100,7 +98,7 @@ class MohrCoulomb(Frictional):
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
         """Return the components of the stress at the end, Pa, with their derivatives, and whether there was flow."""
         x, axes = eigen(trial["b"])
-        with np.errstate(invalid="ignore", divide="ignore"):  # of an iterate gone astray, which is refused
+        with np.errstate(invalid="ignore", divide="ignore"):  # of a diverging iterate, which is refused later
             e = np.log(x) / 2
         order = np.argsort(-e, axis=1, kind="stable")
         back, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
@@ -129,7 +127,7 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return the stresses of ordered principal trial strains, Pa.
+    """Return the principal stresses, Pa, for ordered principal trial strains.
 
     Parameters
     ----------
@@ -168,12 +166,12 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return by how much stresses (n, 3) are outside (n,), Pa."""
+        """Return the violation (n,), Pa, of the yield surface by stresses (n, 3)."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
 class _Return:
-    """The return of ordered trial stresses t (n, 3), Pa, that are outside."""
+    """Return mapping of ordered trial stresses t (n, 3), Pa, outside the yield surface."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
         self._trial = t
@@ -198,8 +196,8 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the stresses that offend least of some ends (n, 3), Pa, their derivatives (n, 3, 3), their offence."""
-        with np.errstate(all="ignore"):  # vertices that are nowhere
+        """Return stresses (n, 3), Pa, of the end with least violation, derivatives (n, 3, 3), and violation (n,)."""
+        with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:
                 ends += [self._at(*vertex) for vertex in self._vertices]
@@ -211,12 +209,12 @@ class _Return:
         return stresses, slopes, offence[best, n]
 
     def _offence(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
-        """Return by how much stresses, and multipliers that must be >= 0, offend (n,), Pa."""
+        """Return the violation (n,), Pa, by stresses, and by multipliers that must be >= 0."""
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses on a face or on the edge of two, their derivatives, and their offence."""
+        """Return stresses on a face or on the edge of two, their derivatives, and their violation."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops
@@ -228,23 +226,23 @@ class _Return:
         return t, slopes, self._offence(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the stresses of a vertex, no derivatives, and the offence; conditions: what must be >= 0 in flow."""
+        """Return stresses of a vertex, zero derivatives, and violation; conditions: give quantities >= 0 in flow."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
         return t, np.zeros((len(t), 3, 3)), self._offence(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return what is >= 0 where an ordered strain is in the cone of the flows of all six faces."""
+        """Return quantities that are >= 0 for an ordered strain in the cone of the flows of all six faces."""
         total, turn = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + turn * x[:, 2], self._q * total + turn * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """The same of two faces that meet where t_2 = t_3, and of the cut-off of t_1."""
+        """Return the same for the two faces at t_2 = t_3 and the cut-off of t_1."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """The same of two faces that meet where t_1 = t_2, and of the cut-off of both."""
+        """Return the same for the two faces at t_1 = t_2 and the cut-off of both."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

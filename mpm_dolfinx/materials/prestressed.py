@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Laws of soil that has a stress where it is seeded.
+"""Laws of soil with an initial stress.
 
-A law is evaluated at F F_i, F counted from the state as seeded and F_i a stretch that the points carry: the soil
-answers as if its stress had come by loading, while volumes, porosities and conductivities count from the state as
-seeded.  F_i has all three axes, also in plane strain.  Laws with the state `plastic`, C_p^-1, have their elastic strain
-in it and need none of this.
+A law is evaluated at F F_i.  F is relative to the seeded state, and F_i is an initial stretch at the points.  The soil
+responds as if loading had caused its initial stress.  Volumes, porosities and conductivities refer to the seeded state.
+F_i has three axes, also in plane strain.  Laws with the state `plastic`, C_p^-1, contain the initial strain in it.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Ends the names of what points carry of a state as seeded, from which yield is told."""
+"""Suffix of point data with the seeded state, the reference for yield."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material whose points may have a stress as seeded, by fields of theirs; at first they have none.
+    """Return a material with a point field for the initial stress, at first zero.
 
     knows_space: whether its law takes F (3, 3).
     """
@@ -44,7 +43,7 @@ def _everywhere(value) -> Callable:
 
 @cache
 def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
-    """Return a law with one more field: `seeded_stretch` F_i (3, 3)."""
+    """Return a law with the additional field `seeded_stretch`, F_i (3, 3)."""
     names = ("energy", "kirchhoff", "update", "trial")
     given = {name: staticmethod(_seen(f, name, knows_space)) for name in names if (f := getattr(law, name)) is not None}
     more = {"__annotations__": {"seeded_stretch": Field}, "seeded_stretch": 1.0}
@@ -53,7 +52,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _seen(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return one of a law's functions, called with F F_i in place of F; stresses and energies are per volume now."""
+    """Return a function of a law evaluated at F F_i; stresses and energies are per seeded volume."""
     taken = Skeleton.taken_by(function)
 
     def of(**given):

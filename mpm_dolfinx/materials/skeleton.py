@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Materials: the law of the skeleton in UFL, and the constants of skeleton and pore fluid.
+"""Materials: constitutive laws of the skeleton in UFL, and constants of skeleton and pore fluid.
 
-Both the material point method and the finite element reference use these, so a law is written once.
-A law of your own is a frozen dataclass derived from `Skeleton`: see there.
+Both the material point method and the finite element reference use them.  User-defined laws derive from `Skeleton`.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.pores.retention import check_retention
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
-"""A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""
+"""A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...)."""
 
 BY_SCENE = ("dt", "cell_size")
-"""What the scene gives to laws: time since the start of the step, s, and mean length of a cell, m."""
+"""Arguments of laws from the scene: time since the start of the step, s, and mean length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""States that the scene sets where a law has them: suction max(-p, 0) at the end of a substep, and as seeded, Pa."""
+"""States that the scene sets: suction max(-p, 0) at the end of a substep, and as seeded, Pa."""
 
 LOCKING = 0.43
-"""Poisson's ratio above which the mean dilatation of a cell is used, at twice the cost of a step.
+"""Poisson's ratio above which cells use the mean dilatation, at twice the cost of a step.
 
-Tip of the drained beam at h = 0.015 m, plain and with it: -0.02 and +0.22 % at nu = 0.3, -0.44 and +0.21 % at
-0.45, -2.0 and +0.21 % at 0.49, -10.3 and -0.02 % at 0.499; at h = 0.06 m and 0.499: -56 and -0.4 %.
+Errors of the drained beam's tip at h = 0.015 m, without and with it: -0.02 and +0.22 % at nu = 0.3, -0.44 and +0.21 %
+at 0.45, -2.0 and +0.21 % at 0.49, -10.3 and -0.02 % at 0.499; at h = 0.06 m and 0.499: -56 and -0.4 %.
 """
 
 APART = 1e-4
-"""By how much equal eigenvalues are set apart, in proportion to them, so that their derivatives are finite.
+"""Relative separation of equal eigenvalues, which keeps their derivatives finite.
 
 Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02.
 """
@@ -47,7 +46,7 @@ Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02.
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Porous skeleton: what every law has.  All but the last may differ from place to place, see `Field`.
+    """Porous skeleton: base of all laws.  Numbers may vary with position, see `Field`.
 
     Parameters
     ----------
@@ -56,7 +55,7 @@ class Skeleton:
     shear
         Shear modulus G, Pa, > 0.
     porosity
-        Volume fraction of the pores at the start n0, in (0, 1).
+        Initial porosity n0, in (0, 1).
     conductivity
         Hydraulic conductivity k, m/s, >= 0.
     biot
@@ -66,63 +65,61 @@ class Skeleton:
     grain_density
         Density of the grains, kg/m^3, >= 0; used with gravity only.
     conductivity_law
-        Function that gives the conductivity k, m/s, in UFL, at the present deformation.  It is called with
-        those of these arguments that it names: conductivity (the field above), F, J = det F, porosity,
-        porosity0, x (present position), p (pore pressure of the cell at the start of the substep, Pa).
+        Function that returns the conductivity k, m/s, as UFL, at the present deformation.  Its arguments may be
+        conductivity (the field above), F, J = det F, porosity, porosity0, x (present position), and p (pore pressure of
+        the cell at the start of the substep, Pa).
     retention
-        How pores drain under suction, and how they then conduct: `VanGenuchten`, `Gardner`, `BrooksCorey` or an object
-        with their methods, see `retention`; by keyword.  None: pores stay full.
+        Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or an object with their
+        methods, see `retention`; keyword only.  None: pores stay saturated.
 
-    A law adds its own parameters as fields of the dataclass and defines one of these static methods, which
-    are called with those arguments that they name: F, the law's fields and properties, its state.  F is (d, d), in
-    axisymmetry (3, 3) with the hoops' stretch last, see `axes`.  So it is in plane strain, with the stretch across the
-    plane, for laws that take it, where Q1 cells would lock and of soil that is seeded with a stress.
+    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Their arguments
+    may be F, the law's fields, properties and state.  F is (d, d), in axisymmetry (3, 3) with the circumferential
+    stretch last, see `axes`.  In plane strain F is (3, 3), with the stretch out of plane last, in two cases: if Q1
+    cells would lock, and for soil with an initial stress.  The law must accept this shape, else F stays (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
     kirchhoff
-        Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), where there is no energy; the tangent is UFL's.
+        Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy; the tangent is UFL's.
 
-    What evolves is the law's `state`, name -> value at the start, which `update` (F, ...) -> {name: UFL}
-    sets anew at the points after every converged step; a state that is not finite cuts the step.
+    The history variables are the law's `state`, name -> initial value.  `update` (F, ...) -> {name: UFL} sets them at
+    the points after every converged step.  A state that is not finite cuts the step.
 
-    Stresses that no closed formula gives have local `unknowns`, name -> value where their iteration begins, which
-    `kirchhoff` and `update` may name.  They are of order one, and so are their equations:
+    Stresses without a closed formula have local `unknowns`, name -> initial value of their iteration.  They are
+    arguments of `kirchhoff` and `update`.  Unknowns and their equations are of order one:
 
     residual
-        Called with the law's fields, its state, its unknowns, and `trial`; gives name -> UFL of the unknown's shape,
-        which Newton's method makes zero at each point.
+        Takes the law's fields, state, unknowns and `trial`; returns name -> UFL of the unknown's shape.  Newton's
+        method makes it zero at each point.
     solution
-        In place of residual, in numpy: called with arrays (n, ...) of the law's fields, its state and `trial`, gives
-        name -> (the unknown (n, ...), {name of a trial value: its derivative by it (n, ..., ...)}).  For returns with
-        many cases, and laws that exist elsewhere: their stress, and what `update` sets the state to, are the unknowns.
-        A derivative may be a function without arguments that gives it: it is called where there is a tangent to make.
-        One that is left out is zero.  Where it gives NaN or infinity there is no solution: the step is cut.  A law with
-        an `energy` that is not stationary in these unknowns takes many Newton steps, for want of second derivatives.
+        Alternative to residual, in numpy.  Takes arrays (n, ...) of the law's fields, state and `trial`; returns
+        name -> (unknown (n, ...), {name of a trial value: derivative with respect to it (n, ..., ...)}).  It suits
+        return mappings with many cases, and existing codes: stress and new state are then the unknowns.  A derivative
+        may be a function without arguments, called when a tangent is assembled.  A missing derivative is zero.
+        NaN or infinity means that there is no solution, and cuts the step.  A law whose `energy` is not stationary in
+        these unknowns takes many Newton steps, because second derivatives are missing.
     trial
-        (F, ...) -> {name: UFL}: all by which the residuals depend on F; without it they name F itself.  What is no UFL
-        in it the residuals do not see; `kirchhoff` and `update` may name `trial` too, and see all of it.
+        (F, ...) -> {name: UFL}: trial values, through which the residuals depend on F; without it the residuals take F.
+        Residuals do not get values other than UFL; `kirchhoff` and `update` may take `trial` with all values.
 
-    All of these functions may name `dt`, the time since the start of the step, s: laws of rates, whose state at the end
-    of a step has to give its stress at dt = 0.  And `cell_size`, the mean length of a cell of the grid, m: by this what
-    softens is made independent of the grid.
+    All these functions may take `dt`, the time since the start of the step, s, for rate-dependent laws.  The state at
+    the end of a step must return the stress of the step at dt = 0.  They may take `cell_size`, the mean length of a
+    cell, m, which makes softening independent of the grid.
 
     A law that depends on suction has `suction`: 0.0 in its state, and may have `suction_at_start`: 0.0.  The scene sets
-    them: max(-p, 0) at the end of a substep, and as seeded, Pa.  Local unknowns see it as one of the `trial`.
+    them: max(-p, 0) at the end of a substep, and as seeded, Pa.  For local unknowns the suction is a `trial` value.
 
-    bulk and shear
-    are also what the scheme takes its scales from (ghost penalty, fixed-stress coefficient, damping of pressures),
-    for every law.
+    For every law bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 
     Raises
     ------
     ValueError
-        A constant that is out of its range; from the scene: fields that are, names or shapes that do not agree, or
-        functions that raise or give anything but UFL of the shape that is wanted.
+        A constant out of its range.  The scene raises it for fields out of range, names or shapes that disagree, and
+        functions that raise or do not return UFL of the required shape.
 
     Examples
     --------
-    A law of your own is a frozen dataclass (the README has one with a fibre)::
+    A user-defined law is a frozen dataclass (the README has one with a fibre)::
 
         @dataclass(frozen=True)
         class Stiffening(mpm.NeoHookean):
@@ -153,12 +150,12 @@ class Skeleton:
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
     elastic_hencky: ClassVar[bool] = False
-    """Whether stresses are those of elastic strains by Hencky's law: then they tell the elastic energy."""
+    """Whether stresses follow from elastic strains by Hencky's law; they then determine the elastic energy."""
     linear: ClassVar[bool] = False
-    """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
+    """Whether the stress is linear in F; one factorisation is then valid until the active cells change."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
-    """Which of `BY_SCENE` the law's functions take."""
+    """Names of `BY_SCENE` that the law's functions take."""
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of the fields and properties that the law's functions take."""
 
@@ -172,7 +169,7 @@ class Skeleton:
         own = {"F", *BY_SCENE, *cls.state, *cls.unknowns, *(["trial"] if cls.unknowns else [])}
         cls.parameters = tuple(name for name in names if name not in own)
         if "energy" in vars(cls) and "linear" not in vars(cls):
-            cls.linear = False  # not what the law had that this one is derived from
+            cls.linear = False  # a new energy does not inherit the linearity of the base class
 
     @staticmethod
     def taken_by(function: Callable | None) -> list[str]:
@@ -219,11 +216,11 @@ class Skeleton:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the tangent is symmetric; laws that give the stress are taken not to be."""
+        """Whether the tangent is symmetric; assumed false for laws defined by their stress."""
         return self.kirchhoff is None
 
     def check_cells(self, cell_size: float) -> None:
-        """Refuse cells too large for a law that softens, with a ValueError; cell_size: m."""
+        """Raise ValueError if cells are too large for a softening law; cell_size: m."""
 
     @classmethod
     def first_piola(cls, F, values: Mapping[str, object]):
@@ -242,19 +239,19 @@ class Skeleton:
 
     @classmethod
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
-        """Return the Kirchhoff stress of the shape of F, Pa, as UFL, of a law that gives it."""
+        """Return the Kirchhoff stress of a law without an energy, Pa, in the shape of F, as UFL."""
         d = F.ufl_shape[0]
         tau = cls._kirchhoff(F, values, (d, d))
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress of a shape or (3, 3), Pa, as UFL; it may depend on F by local unknowns alone."""
+        """Return the Kirchhoff stress, `shape` or (3, 3), Pa, as UFL; local unknowns may be its only link to F."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
     def out_of_plane(cls, F, values: Mapping[str, object]):
-        """Return the effective Cauchy stress across the plane of plane strain, Pa, as UFL; None if the law has none.
+        """Return the effective Cauchy stress out of plane in plane strain, Pa, as UFL; None if the law has none.
 
         Parameters
         ----------
@@ -266,17 +263,17 @@ class Skeleton:
         if cls.kirchhoff is not None:
             tau = cls._kirchhoff(F, values, (2, 2))
             return tau[2, 2] / ufl.det(F) if tau.ufl_shape == (3, 3) else None
-        if cls.unknowns:  # by how much these change with a stretch across the plane is not known
+        if cls.unknowns:  # their derivative by a stretch out of plane is not available
             return None
         whole = ufl.variable(ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]]))
         try:
             energy = expression(cls.energy, [()], "F", F=whole, **values)
-        except ValueError:  # a law of the user's for the plane only
+        except ValueError:  # a user-defined law for the plane only
             return None
         return ufl.diff(energy, whole)[2, 2] / ufl.det(F)
 
     def drained_modulus(self, dim: int) -> float:
-        """Return the drained bulk modulus K_dr, Pa, of so many axes of F: K of three, lambda + G in plane strain."""
+        """Return the drained bulk modulus K_dr, Pa, for F (dim, dim): K for dim = 3, lambda + G in plane strain."""
         return self.bulk if dim == 3 else self.bulk + self.shear / 3
 
     @property
@@ -286,7 +283,7 @@ class Skeleton:
 
     @property
     def nearly_incompressible(self) -> bool:
-        """Whether Q1 cells would lock, so that the law is given the mean dilatation of each cell (`dilatation`)."""
+        """Whether Q1 cells would lock, so that the law needs the mean dilatation of each cell (`dilatation`)."""
         return self.poisson > LOCKING
 
     @property
@@ -297,10 +294,10 @@ class Skeleton:
     def pressure_damping(self) -> float:
         """Return tau, 1/Pa: a quarter of the jump stabilisation of 2 x 2 cells, half of it for laws with a state.
 
-        3 alpha^2 / (8 (lambda + 3G)); a quarter is better conditioned and smears less (Silvester and Kechkar 1990;
-        Camargo, White and Borja 2021).  That of 2 x 2 x 2 cells is up to 0.44 less: too little in 3D for pressures that
-        alternate along two axes alone, which are those of plane strain.  What alternates as soil begins to yield
-        stays: the damping, of the step's increments, does not see it any more.
+        The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter is better conditioned and smears less (Silvester and
+        Kechkar 1990; Camargo, White and Borja 2021).  The value of 2 x 2 x 2 cells is up to 0.44 smaller.  In 3D this
+        is too little for pressures that alternate along two axes only, as in plane strain.  The damping acts on
+        increments of a step, so an oscillation from the onset of yield remains.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -311,19 +308,19 @@ class Skeleton:
 
 
 def constants_of(material: Skeleton) -> list[str]:
-    """Return the names of a material's constants, which may differ from place to place."""
+    """Return the names of a material's constants, which may vary with position."""
     return [f.name for f in fields(material) if f.name not in ("conductivity_law", "retention")]
 
 
 def check_given(obj, allowed: Mapping[str, str]) -> None:
-    """Refuse a material without one of the constants that have no values safe to assume; allowed: what they may be."""
+    """Raise ValueError if a constant without a safe default is missing; allowed: range of each such constant."""
     for name, what in allowed.items():
         if getattr(obj, name) is None:
             raise ValueError(f"{type(obj).__name__}: {name} is not given, must be {what}")
 
 
 def _check(obj, name: str, test: Callable, allowed: str) -> None:
-    """Refuse a constant, or the first value of an array, that fails a test; fields wait until they are evaluated."""
+    """Raise ValueError for a constant, or the first value of an array, that fails a test; skip functions of place."""
     value = getattr(obj, name)
     if callable(value):
         return
@@ -340,9 +337,9 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
 class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, lambda_i the principal stretches.
 
-    Plane strain in 2D.  Hencky (1928); a small constant under the root keeps the derivatives of the
-    eigenvalues of C = F^T F finite where they coincide.  It enters the deviatoric part only, whose
-    derivative vanishes there: at rest there is no stress at all.  Parameters as for `Skeleton`.
+    Plane strain in 2D.  Source: Hencky (1928).  A small constant under the root keeps the derivatives of equal
+    eigenvalues of C = F^T F finite.  It is in the deviatoric part only, whose derivative vanishes there, so the stress
+    at rest is exactly zero.  Parameters as for `Skeleton`.
     """
 
     @staticmethod
@@ -368,10 +365,10 @@ def _deviatoric(F):
 
 
 def _spread(C):
-    """Return by how much the logarithms of the principal stretches of a symmetric 2x2 tensor differ, as UFL.
+    """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
-    Its eigenvalues over their mean are 1 + radius and 1 - radius: one quotient, where second derivatives of C / mean
-    take twice as many divisions.
+    The eigenvalues over their mean are 1 + radius and 1 - radius.  This has one quotient; second derivatives of
+    C / mean would take twice as many divisions.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + APART**2 / 4)
@@ -379,7 +376,7 @@ def _spread(C):
 
 
 def _eigenvalues(C, apart: float = APART):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL, equal ones set apart."""
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; equal ones are separated by `apart`."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + apart**2) / 2
@@ -425,43 +422,42 @@ class LinearElastic(Skeleton):
 def kozeny_carman(conductivity, porosity, porosity0):
     """Return k = k0 n^3 / (1 - n)^2 / (n0^3 / (1 - n0)^2), m/s, the law of Kozeny (1927) and Carman (1937).
 
-    To be given to a material as its `conductivity_law`.
+    Use it as `conductivity_law` of a material.
 
     Parameters
     ----------
     conductivity
-        k0, m/s: the material's conductivity, at the porosity at the start.
+        k0, m/s: the material's conductivity at the initial porosity.
     porosity, porosity0
-        Porosity now and at the start, n and n0, in (0, 1).
+        Present and initial porosity, n and n0, in (0, 1).
     """
     return conductivity * (porosity / porosity0) ** 3 * ((1 - porosity0) / (1 - porosity)) ** 2
 
 
 def filled(p, suction):
-    """Return how full the pores that drain are at a pressure p, Pa, from 0 at -`suction` to 1 at `suction`: a cubic."""
+    """Return the saturation of drainable pores at a pressure p, Pa: a cubic, 0 at -`suction` and 1 at `suction`."""
     x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
     return x**2 * (3 - 2 * x)
 
 
 @dataclass(frozen=True, eq=False)
 class unsaturated:
-    """A conductivity law by which water flows below a free surface only: to be given as `conductivity_law`.
+    """Conductivity law for flow below a free surface; use it as `conductivity_law` of a material.
 
-    The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a cubic without kinks (Bathe and
-    Khoshgoftaar 1979).  By the same cubic pores lose their `specific_yield`; the rest is held by suction, and in the
-    weight all pores are full.  The conductivity is that of the pressure at the start of each substep: steady flow is
-    reached in steps of some (cell size)^2 / (coefficient of consolidation), and a surface that falls or rises passes
-    less than a cell in a step.
+    The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
+    Khoshgoftaar 1979).  Pores lose their `specific_yield` by the same cubic and retain the rest.  The weight counts all
+    pores as full.  The pressure is taken at the start of each substep.  Steady flow therefore needs steps of some
+    (cell size)^2 / (coefficient of consolidation), and a free surface must pass less than a cell in a step.
 
     Parameters
     ----------
     suction
-        Pa, > 0: half to once the weight of water over a cell's height.
+        Pa, > 0: half to once the weight of water over the height of a cell.
     least
-        In (0, 1).
+        Relative conductivity of drained soil, in (0, 1).
     specific_yield
-        Volume of water that drains from a volume of soil as the free surface falls through it, in [0, 1), at most the
-        porosity.  With 0 a surface that falls does so at once, and the law is one of steady flow.
+        Drainable porosity, in [0, 1), at most the porosity.  With 0 a free surface falls at once, and the law is one of
+        steady flow.
     """
 
     suction: float
@@ -488,17 +484,16 @@ class Fluid:
     bulk
         Bulk modulus K_w, Pa, > 0; infinite for an incompressible fluid.
     density
-        Density rho_w at zero pressure, kg/m^3, > 0, by which its weight counts; that of flowing mass is
-        rho_w exp(p / K_w).
+        Density rho_w at zero pressure, kg/m^3, > 0, used for the weight; the flowing mass has rho_w exp(p / K_w).
     gravity
-        Acceleration under which conductivities are what they are, m/s^2, > 0; by default that of the scene where it is
-        given as a vector, which is not zero, else 9.81.  In a scene without gravity, or with one that changes with
-        time, give it where lengths or times have other units than m and s.
+        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default the scene's gravity if it is a
+        constant vector other than zero, else 9.81.  With units other than m and s it must be given in scenes without
+        gravity or with gravity as a function of time.
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range.
+        A constant out of its range.
     """
 
     bulk: float = 2.2e9
@@ -510,7 +505,7 @@ class Fluid:
         if self.gravity is not None:
             _check(self, "gravity", lambda v: (0 < v) & (v < inf), "> 0 and finite")
         _check(self, "density", lambda v: (0 < v) & (v < inf), "> 0 and finite")
-        object.__setattr__(self, "density", float(self.density))  # an integer times gravity is no form that compiles
+        object.__setattr__(self, "density", float(self.density))  # forms with an integer times gravity do not compile
 
     @property
     def unit_weight(self) -> float:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Drucker and Prager's soil that loses its cohesion as it slips, and resists with a viscosity.
+"""Drucker and Prager's law with loss of cohesion by slip, and a viscosity.
 
-What softens localises in bands one cell wide, whatever the cells: softening by strain would take the less work the
-finer the grid.  So the cohesion falls with the slip along such a band, gamma h, of the plastic shear strain gamma and
-the cell's size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
+Softening localises in shear bands one cell wide.  With softening by strain the dissipated work would decrease with the
+cell size.  The cohesion therefore falls with the slip of a band, gamma h, for a plastic shear strain gamma and cell
+size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
 
     c = c_0 - (c_0 - c_r) min(1, gamma h / s),
 
-and the work to part the soil along a band is that of (c_0 - c_r) s / 2 on any grid.  The viscosity is Perzyna's,
-f = eta dgamma/dt, without an exponent: implicit in the step, and none as the rate goes to nothing.
+and softening along a band dissipates (c_0 - c_r) s / 2 on any grid.  The viscosity is Perzyna's, f = eta dgamma/dt,
+linear and implicit; it vanishes for slow loading.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from mpm_dolfinx.materials.skeleton import Field, _check, check_given
 from mpm_dolfinx.materials.trial import Trial
 
 GIVEN = {"residual": "in [0, cohesion] Pa", "slip": "> 0 m"}
-"""Constants that must be given, and what they may be."""
+"""Required constants and their ranges."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SofteningDruckerPrager(DruckerPrager):
-    """Drucker-Prager soil whose cohesion falls as it slips, at a rate.
+    """Drucker-Prager soil with a cohesion that decreases with slip, and a viscosity.
 
     Parameters
     ----------
     residual
-        Cohesion c_r that is left, Pa, in [0, cohesion]; with the cohesion itself nothing softens.
+        Residual cohesion c_r, Pa, in [0, cohesion]; equal to the cohesion there is no softening.
     slip
-        Slip s along a band of shear, m, > 0, over which the cohesion falls to that.  Where cells are so large that soil
-        softens faster than it unloads it is refused.
+        Slip s along a shear band, m, > 0, at which the cohesion is c_r.  Cells so large that soil would soften faster
+        than it unloads are refused.
     viscosity
         eta, Pa s, >= 0: sqrt(J_2) + eta_phi p - xi c = eta dgamma/dt.
 
-    The other parameters are those of `DruckerPrager`, without hardening.  The state is `plastic` and `hardened`, xi
-    times the plastic shear strain.  At the apex of the cone soil that is torn apart has the residual cohesion.
+    Other parameters: see `DruckerPrager`, without hardening.  The state is `plastic` and `hardened`, xi times the
+    plastic shear strain.  Soil torn apart at the apex of the cone has the residual cohesion.
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range, or is not given.
+        A constant out of its range, or missing.
     """
 
     residual: Field = None
@@ -94,12 +94,12 @@ class SofteningDruckerPrager(DruckerPrager):
 
 
 def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, residual, strain, drag) -> dict:
-    """Return the stress as `drucker_prager.returned` does; strain: that at which the cohesion is the residual one."""
+    """Return the stress like `drucker_prager.returned`; strain: plastic shear strain at the residual cohesion."""
     end = xi * strain  # in terms of `hardened`
     moduli = trial, bulk, shear, eta, xi, eta_flow
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)
     left = returned(*moduli, residual, 0.0, hardened, drag)
-    # what ends at the apex is torn: in that branch softening has no meaning
+    # soil at the apex is torn apart: it has the residual cohesion
     grown = hardened + falling["hardened"]
     falls = ufl.le(ufl.conditional(ufl.gt(falling["apex"], 0.5), 2 * end, grown), end)
     out = {name: ufl.conditional(falls, falling[name], left[name]) for name in ("p", "ratio", "hardened")}

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The trial elastic strain of multiplicative plasticity, and isotropic functions: in UFL, and in numpy.
+"""Trial elastic strain of multiplicative plasticity, and isotropic functions, in UFL and in numpy.
 
-In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues: exact for smooth
-functions of each eigenvalue, and smooth where eigenvalues are equal, because nodes need not be eigenvalues and are
-kept apart. Principal values that are functions of all three, with kinks, need the eigenvalues themselves: they are
-found in numpy, with the exact derivative, see `Coaxial`.
+In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
+smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because the nodes are kept separate.
+Principal values that depend on all three eigenvalues, with kinks, have exact derivatives in numpy, see `Coaxial`.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class Trial:
     plastic
         C_p^-1 (3, 3).
     prestretch
-        Principal elastic stretches (3,) at F = I, if there are any.
+        Principal elastic stretches (3,) at F = I, or None.
     """
 
     def __init__(self, F, plastic, prestretch=None):
@@ -76,7 +75,7 @@ def components(b, plane: bool):
 
 
 def symmetric(values):
-    """Return the symmetric UFL tensor (3, 3) of all its six components."""
+    """Return the symmetric UFL tensor (3, 3) with six components."""
     place = {}
     for k, (i, j) in enumerate(SPACE):
         place[i, j] = place[j, i] = values[k]
@@ -90,7 +89,7 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
         full = np.empty((n, 3, 3))
         for k, (i, j) in enumerate(SPACE):
             full[:, i, j] = full[:, j, i] = b[:, k]
-        lost = ~np.isfinite(b).all(axis=1)  # of an iterate gone astray
+        lost = ~np.isfinite(b).all(axis=1)  # of a diverging iterate
         full[lost] = np.eye(3)
         x, axes = np.linalg.eigh(full)
         return np.where(lost[:, None], np.nan, x), axes
@@ -106,16 +105,16 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class Coaxial:
-    """Tensors with the axes of others.
+    """Tensors coaxial with given tensors.
 
     Parameters
     ----------
     x, axes : (n, 3), (n, 3, 3)
-        Eigenvalues and axes of the others, see `eigen`.
+        Eigenvalues and axes of the given tensors, see `eigen`.
     y : (n, 3)
-        Principal values.
+        Principal values of the coaxial tensors.
     plane
-        Whether tensors are those of plane strain or axisymmetry.
+        Whether tensors have the components `PLANE`, for plane strain and axisymmetry.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -138,10 +137,10 @@ class Coaxial:
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivatives (n, 6, 4 or 6) by the components of the others; slopes (n, 3, 3): those of y by x.
+        """Return the derivatives (n, 6, 4 or 6) by the components of the given tensors; slopes (n, 3, 3): dy/dx.
 
-        In the axes dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij beside the diagonal; where x_i = x_j it is
-        (dy_i/dx_i - dy_i/dx_j) dx_ij, for an isotropic function has y_i = y_j there.
+        In principal axes, off the diagonal, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij.  For x_i = x_j the limit is
+        (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.
         """
         x = self._x
         y = self._y

@@ -1,34 +1,33 @@
 # SPDX-License-Identifier: MIT
-"""Physics of the user's own: functions that return UFL, called with those arguments that they name.
+"""User-defined functions that return UFL.
 
-Laws and conductivities are the material's: see `skeleton.Skeleton`.  Terms of the balances are given to
-`Simulation`; they are integrated over the configuration at the start of the step, by these names:
+Their arguments are chosen by name.  Laws and conductivities belong to materials: see `skeleton.Skeleton`.  Terms of the
+balances are given to `Simulation`, and integrated over the configuration at the start of the step.  Arguments:
 
 points
-    The points of integration.  `points.dx`: their measure; `points.value(f)`, `points.grad(f)`: f and its
-    gradient, f one of u and v, in axisymmetry (3, 3), with f_r / r; `points.F`: deformation gradient at the start of
-    the step, of the same shape, whose determinant is the volume ratio;
-    `points.position`, `points.displacement`: place, and displacement since the start (or since it was reset),
-    both at the start of the step; and what the material points carry in `points.data`: fields of the materials
-    that are functions of place, and the laws' state.
+    Quadrature points.  `points.dx`: their measure; `points.value(f)`, `points.grad(f)`: f and its gradient, f one of
+    u and v, in axisymmetry (3, 3) with f_r / r; `points.F`: deformation gradient at the start of the step, of the same
+    shape, with the volume ratio as determinant; `points.position`, `points.displacement`: position, and displacement
+    since the start (or its last reset), both at the start of the step.  Data of the material points: fields of the
+    materials that are functions of position, and the laws' state.
 t
-    Time at which the balances are taken, s, a UFL constant: at the end of the step, and of its first substep.
+    Time of the balances, s, a UFL constant: the end of the step or of its first substep.
 
 A function in `terms` adds to the balance of momentum, int P : grad v dV - loads + term = 0:
 
 u
     Increment of the displacement in the step, m; Q1.
 v
-    Test function.  The term is a linear form in v, such as -inner(b, points.value(v)) * points.dx for a
-    body force b; or a stored energy without v, whose derivative is added.
+    Test function.  The term is a linear form in v, such as -inner(b, points.value(v)) * points.dx for a body force b.
+    Without v it is a stored energy, and its derivative is added.
 velocity
-    Rate of the displacement, m/s, of the order of the time integration: for what resists motion.
+    Velocity, m/s, of the order of the time integration, for viscous resistance.
 dt
-    Time since the start of the step, s, a UFL constant: u / dt is the mean rate since then.
+    Time since the start of the step, s, a UFL constant; u / dt is the mean velocity.
 
-A term that is linear in v and depends on u is taken to have an unsymmetric tangent.
+The tangent of a term in v and u is assumed unsymmetric.
 
-The function of a `Source` gives the volume of fluid, as at zero pressure, that is brought in a time, m^d/s:
+The function of a `Source` returns the inflow as a volume of fluid at zero pressure in a time, m^d/s:
 
 q
     Test function, constant in the cells: the source is s * q * points.dx with s in 1/s.
@@ -53,12 +52,12 @@ from mpm_dolfinx.base.validation import asked, instance, line, line_of
 
 
 def call(function: Callable, kind: str = "UFL", /, **available):
-    """Call a function of the user's, which gives UFL or another kind, with those arguments that it names.
+    """Call a user-defined function with the arguments in its signature; kind: type of its result, for messages.
 
     Raises
     ------
     ValueError
-        Naming the function, the argument that there is not, and those that there are; or what it raises.
+        The function has an unknown argument, or raises.
     """
     wanted = list(signature(function).parameters)
     for name in wanted:
@@ -69,18 +68,18 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 
 
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
-    """Return the UFL expression that a function of the user's gives, of one of some shapes.
+    """Return the UFL expression of a user-defined function, with one of the given shapes.
 
     Raises
     ------
     ValueError
-        As `call`; what it gives is no UFL, has another shape, or does not depend on the argument `of`.
+        As `call`; or the result is no UFL, has another shape, or does not depend on the argument `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
     try:
         out = ufl.as_ufl(value)
-        apply_algebra_lowering(out)  # where UFL finds most of what cannot be
+        apply_algebra_lowering(out)  # here UFL detects most errors
     except Exception as error:  # UFL has several kinds
         why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
         raise ValueError(f"{_name(function)}: gives {line(value)}{why}, must be {allowed}") from error
@@ -93,7 +92,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Refuse numbers that no compiler takes, and sums over an index of two sizes, which new releases of UFL form."""
+    """Raise ValueError for numbers that do not compile, and for sums over an index of two sizes, valid in new UFL."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")
@@ -106,14 +105,14 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return what a function of the user's gives by names as UFL of their shapes; some: whether names may be left out.
+    """Return a user-defined function's dict as UFL with the given shapes; some: whether names may be missing.
 
     Raises
     ------
     ValueError
-        In one line: it is no dict of UFL with these names and shapes, or depends on nothing.
+        The result is no dict of UFL with these names and shapes, or is constant.
     """
-    instance(f"{what}: what it gives", given, dict)
+    instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
     for name, value in given.items():
         try:
@@ -130,12 +129,12 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
 
 
 def form(kind: str, function: Callable, **available) -> ufl.Form:
-    """Return the form that a function of the user's gives, integrated over the points.
+    """Return the form of a user-defined function, integrated over the points.
 
     Raises
     ------
     ValueError
-        As `call`; or what it gives is no form, or has integrals that are not over the points.
+        As `call`; or the result is no form, or has integrals over the grid.
     """
     out, dx = call(function, **available), available["points"].dx
     allowed = "a form with points.dx"
@@ -149,12 +148,12 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
 
 
 def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **available) -> tuple[ufl.Form, bool]:
-    """Return a term of the user's as a linear form in the test function, and whether it is the slope of an energy.
+    """Return a user-defined term as a linear form in the test function, and whether it derives from an energy.
 
     Raises
     ------
     ValueError
-        As `form`; or it depends on neither the unknown nor v.
+        As `form`; or the term depends on neither the unknown nor v.
     """
     out = form("terms", term, **available)
     if out.arguments():
@@ -166,10 +165,10 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Name the object and the remedy where UFL or its compiler refuses an expression, with a ValueError."""
+    """Turn errors of UFL and its compiler into a ValueError that names the object and the allowed values."""
     try:
         yield
-    except (Exception, ArityMismatch) as error:  # UFL and FFCx have many kinds, one is no Exception
+    except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
         if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # an OSError: the compiler is at fault
             raise
         why = f"{type(error).__name__}: {line_of(error)}"
@@ -177,7 +176,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Whether an error was raised by this package, which has named the object."""
+    """Whether this package raised an error; its message then names the object."""
     frames = error.__traceback__
     while frames.tb_next is not None:
         frames = frames.tb_next

@@ -180,7 +180,7 @@ class MomentumForms:
             self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return what the forces at (u, p) gain by the cells' pressures through suction, see `OfSuction.rows`."""
+        """Return derivatives of the forces at (u, p) by the cells' pressures through suction, see `OfSuction.rows`."""
         return [] if self._of_suction is None else self._of_suction.rows(data)
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -564,7 +564,7 @@ class MomentumProblem:
         return out
 
     def of_suction(self, data: QuadratureData | None = None) -> list[tuple[NDArray, NDArray]]:
-        """Return what the forces gain by the cells' pressures through suction, see `OfSuction.rows`."""
+        """Return derivatives of the forces by the cells' pressures through suction, see `OfSuction.rows`."""
         return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(

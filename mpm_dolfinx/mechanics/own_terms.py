@@ -82,7 +82,7 @@ class OwnTerms:
 class OwnTermsOfStage(Acting):
     """The terms in a stage, with the faces of terms on sides."""
 
-    title = "terms of the user's"
+    title = "user-defined terms"
 
     def __init__(self, terms: Sequence[OwnTerm], setting: Setting):
         self._grid, self.linear = setting.grid, all(term.slope is None for term in terms)

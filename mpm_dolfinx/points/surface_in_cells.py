@@ -54,7 +54,7 @@ class Region:
         size = edges + 1 + count
         odd = np.flatnonzero(size % 2)
         after = np.where((np.arange(most) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x[:, :1])
-        at = (edges + size[odd] - 1) // 2  # in the middle of those that are not of the surface
+        at = (edges + size[odd] - 1) // 2  # in the middle of the edges inside the body
         place = np.arange(most)[None]
         middle = (x[odd, at] + after[odd, at]) / 2
         grown = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)

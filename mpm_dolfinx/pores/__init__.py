@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Pores: laws of retention, and the water that pores hold."""
+"""Pores: retention curves and pore water."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The water that pieces of domains bring to their cells, where pores drain: the pressure at which a cell holds it.
+"""Pressures of cells from the pore water of their pieces, in unsaturated soil.
 
-A volume that stores s per pressure, with pores n, holds c(p) = s pi(p) + n (S(p) - 1) rho(p) more than it does at zero
-pressure: pi is the mass potential, rho the density over that at zero pressure.  Of several soils, and of pieces that
-lie higher or lower than their cell's centroid, it is c(p + o) with each piece's own S and offset o.
+The content of a volume with storage s and pores n, relative to zero pressure, is c(p) = s pi(p) + n (S(p) - 1) rho(p).
+pi is the mass potential, rho the density over the density at zero pressure.  A piece at another height than the
+centroid of its cell, or of another soil, contributes c(p + o) with its own S and offset o.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (
 
 @dataclass(frozen=True)
 class PoreWater:
-    """What m pieces in n cells store.
+    """Water storage of m pieces in n cells.
 
-    saturation: gives S and its slope (m,), 1/Pa, at pressures (m,), Pa, and may give more; slot (m,): cell of each
-    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: of the fluid, Pa; scale (n,): suction about which pores of a cell
+    saturation: function of pressures (m,), Pa, returns S, its slope (m,), 1/Pa, and maybe more; slot (m,): cell of each
+    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: of the fluid, Pa; scale (n,): suction at which pores of a cell
     drain, Pa.
     """
 
@@ -54,16 +54,16 @@ class PoreWater:
     def level(
         self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, at which cells hold these contents (n,), m^d.
+        """Return the pressures (n,), Pa, of cells with given contents (n,), m^d.
 
         Newton's method on the logarithm of the suction, within a bracket.
 
         Parameters
         ----------
         p : (n,), Pa
-            Where it begins, and the answer where this content is met.
+            Initial values, returned unchanged if their contents are right.
         offset : (m,), Pa
-            By how much the pressures of pieces differ from their cells'.
+            Pressures of pieces minus pressures of their cells.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)
@@ -89,12 +89,12 @@ class PoreWater:
             if not (bad & ~done).any():
                 return p
             y = np.where(bad, there, y)
-        raise NotConverged("water that pores hold: no pressure is found for it")
+        raise NotConverged("pore water: no pressure is found for the water content")
 
 
 def emptied(
     p: NDArray[np.float64], bulk: float, S: NDArray[np.float64], slope: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (S - 1) rho and its slope, 1/Pa, at pressures (m,), Pa, of saturations and theirs, 1/Pa."""
+    """Return (S - 1) rho and its slope, 1/Pa, for pressures (m,), Pa, saturations, and slopes of S, 1/Pa."""
     density = np.exp(p / bulk)
     return (S - 1) * density, (slope + (S - 1) / bulk) * density

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Retention: how full pores are at a pressure, how they conduct, and the share of it that the skeleton feels.
+"""Retention curves: saturation, relative permeability and Bishop's coefficient as functions of the pressure.
 
-Air is at zero pressure everywhere, so the suction is s = -p.  Without suction pores are full.  With the saturation S
+Air has zero pressure everywhere, so the suction is s = -p.  Without suction pores are saturated.  With the saturation S
 and the relative permeability k_r, both functions of p,
 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
-(Richards 1931; Bishop 1959).  chi is the effective saturation S_e = (S - S_r) / (1 - S_r), or the law's own.
+(Richards 1931; Bishop 1959).  By default chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
 
-A law of the user's is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  Its
-`bishop(p)` is chi, without one chi = S.  One derived from `Retention` has constants that are no part of what is
-compiled.
+A user-defined law is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  Its optional
+`bishop(p)` is chi; by default chi = S.  Constants of laws derived from `Retention` can change without compilation.
 """
 
 from __future__ import annotations
@@ -44,14 +43,14 @@ class Retention:
     Parameters
     ----------
     entry
-        Suction about which pores begin to drain, Pa, > 0.
+        Suction at which pores begin to drain, Pa, > 0.
     residual
-        Saturation S_r that no suction drains, in [0, 1).
+        Residual saturation S_r, in [0, 1).
 
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range.
+        A constant out of its range.
     """
 
     entry: float
@@ -63,7 +62,7 @@ class Retention:
 
     @property
     def scale(self) -> float:
-        """Suction, Pa, about which saturation and permeability fall."""
+        """Characteristic suction of saturation and permeability, Pa."""
         return self.entry
 
     def bishop(self, p):
@@ -90,14 +89,14 @@ class VanGenuchten(Retention):
     entry
         1 / alpha as a pressure, Pa, > 0: the weight of water over alpha in 1/m.
     residual
-        Saturation S_r that no suction drains, in [0, 1).
+        Residual saturation S_r, in [0, 1).
     n
-        How evenly wide pores are, in (1, 20].
+        Uniformity of the pore sizes, in (1, 20].
     l
         Connectivity of the pores, a number.
     air_entry
-        Suction below which all pores are full, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  With n < 2 the permeability
-        falls infinitely steeply at s = 0 without it; the height of a few centimetres of water is usual.
+        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  For n < 2 and zero air
+        entry the permeability has an infinite slope at s = 0.  A few centimetres of water are usual.
     """
 
     n: float = 2.0
@@ -111,11 +110,11 @@ class VanGenuchten(Retention):
         _number(self, "air_entry", lambda v: v >= 0, ">= 0 and finite")
 
     def _wide(self, x):
-        """Return x^(n-1) (1 + x^n)^-m, the share of the conductance of pores that are empty, under a root."""
+        """Return x^(n-1) (1 + x^n)^-m, so that (1 - it)^2 is Mualem's integral factor."""
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
 
     def _least(self):
-        """Return the suction below which all pores are full, over `entry`; powers of zero have no derivatives."""
+        """Return the air entry over `entry`, > 0, because powers of zero have no derivatives."""
         return ufl.max_value(self.air_entry / self.entry, TINY)
 
     def effective(self, s):
@@ -136,9 +135,9 @@ class Gardner(Retention):
     Parameters
     ----------
     entry
-        Suction in which they fall by e, Pa, > 0: the weight of water over Gardner's alpha in 1/m.
+        Suction that reduces them by a factor e, Pa, > 0: the weight of water over Gardner's alpha in 1/m.
     residual
-        Saturation S_r that no suction drains, in [0, 1).
+        Residual saturation S_r, in [0, 1).
     """
 
     def effective(self, s):
@@ -155,11 +154,11 @@ class BrooksCorey(Retention):
     Parameters
     ----------
     entry
-        Suction below which all pores are full, Pa, > 0.
+        Suction below which all pores are saturated, Pa, > 0.
     residual
-        Saturation S_r that no suction drains, in [0, 1).
+        Residual saturation S_r, in [0, 1).
     index
-        How evenly wide pores are, in (0, 20].
+        Uniformity of the pore sizes, in (0, 20].
     """
 
     index: float = 2.0
@@ -178,15 +177,15 @@ class BrooksCorey(Retention):
 
 
 def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
-    """Refuse a constant of a law that fails a test."""
+    """Raise ValueError for a constant of a law that fails a test."""
     what = f"{type(law).__name__}: {name}"
     numbers(what, getattr(law, name), test=lambda v: np.isfinite(v) & test(v), allowed=allowed)
 
 
 def check_retention(what: str, law) -> None:
-    """Refuse, with a ValueError, what is no law of retention, or none whose values are possible.
+    """Raise ValueError for an invalid retention curve.
 
-    S and k_r are in [0, 1], are 1 at p >= 0, and do not rise with the suction.
+    S and k_r must be in [0, 1], 1 at p >= 0, and must not rise with the suction.
     """
     missing = [name for name in METHODS if not callable(getattr(law, name, None))]
     if missing:
@@ -206,23 +205,23 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return saturations and relative permeabilities at some suctions, which tell a law from another."""
+    """Return saturations and relative permeabilities at some suctions, as a fingerprint of the law."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the number that a function of p, which returns UFL, has at a pressure, Pa."""
+    """Return the number at a pressure, Pa, of a function of p that returns UFL."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
 def chi_at(law, p: float) -> float:
-    """Return chi, the share of a pressure p, Pa, that the skeleton feels by a law."""
+    """Return Bishop's coefficient chi of a law at a pressure p, Pa."""
     return _value(partial(property_of, law, "bishop"), p)
 
 
 def _empty(function: Callable, suction: float) -> bool:
-    """Return whether a function of p has fallen to a half at a suction, Pa, or is no number there."""
+    """Return whether a function of p is at most a half, or not a number, at a suction, Pa."""
     try:
         return not _value(function, -suction) > 0.5
     except OverflowError:
@@ -230,9 +229,9 @@ def _empty(function: Callable, suction: float) -> bool:
 
 
 def scale_of(law) -> float:
-    """Return the suction about which a law's saturation falls, Pa: its `scale`, or about where half of the pores drain.
+    """Return the characteristic suction of a law, Pa: its `scale`, or approximately where the saturation is a half.
 
-    Without such a suction it is the one at which the permeability has halved.
+    If the saturation does not fall that far, the permeability is used.
     """
     if (scale := getattr(law, "scale", None)) is not None:
         return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
@@ -249,16 +248,16 @@ def scale_of(law) -> float:
 
 
 class Retentions:
-    """The laws of retention of a scene, as UFL of what points carry of theirs.
+    """Retention curves of a scene, as UFL of point data.
 
-    Points carry a row: the number of the kind of their law, from 1, and its constants; zero where pores stay full.
-    Pieces of domains also carry their `lever`, the way to them from the centroid of what their cell holds.  The
-    pressure that they see is that of water at rest about the cell's.
+    Points carry a row: the number of the kind of their law, from 1, and its constants; 0 if pores stay saturated.
+    Pieces also carry their `lever`, the vector from the centroid of the material in their cell.  Their pressure is
+    hydrostatic about the pressure of the cell.
 
     Parameters
     ----------
     laws
-        The different laws of the scene's materials.
+        Distinct retention curves of the scene's materials.
     everywhere
         Whether every material has one.
     grid
@@ -267,7 +266,7 @@ class Retentions:
 
     def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
         self.weight = fem.Constant(grid.mesh, np.zeros(grid.dim))
-        """Weight of the fluid when the grid was reset, N/m^3; zero where none can flow."""
+        """Weight of the fluid at the grid reset, N/m^3; zero if no fluid can flow."""
         self.laws = list(laws)
         self._everywhere = everywhere
         self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
@@ -292,7 +291,7 @@ class Retentions:
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures at levers (m, d), m, differ from those of cells (m,), Pa."""
+        """Return the pressure offset from the cell (m,), Pa, at levers (m, d), m."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
@@ -307,7 +306,7 @@ class Retentions:
         name
             "saturation", "relative_permeability" or "bishop".
         points
-            They have the fields retention and, as pieces, lever.
+            Points with the field retention, and for pieces with lever.
         """
         row = points.retention
         p = self.at(p, points)
@@ -322,12 +321,12 @@ class Retentions:
 
 
 def _constants(law) -> list[str]:
-    """Return the names of the numbers of a law that are no part of what is compiled."""
+    """Return the names of a law's constants that are not compiled into forms."""
     return [f.name for f in fields(law)] if isinstance(law, Retention) else []
 
 
 def _lifted(law, values: Sequence):
-    """Return a law with UFL in the place of its numbers."""
+    """Return a law with UFL in place of its constants."""
     out = copy(law)
     if isinstance(law, Retention):
         vars(out).update(zip(_constants(law), values, strict=False))
@@ -342,12 +341,12 @@ def property_of(law, name: str, p):
 
 
 def _called(law, name: str, p):
-    """Return what a method of a law gives at p, a number as UFL.
+    """Return the result of a law's method at p as UFL.
 
     Raises
     ------
     ValueError
-        It raises, or gives no scalar.
+        The method raises, or its result is no scalar.
     """
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
@@ -384,16 +383,16 @@ class SaturationAt:
 
 
 def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
-    """Return points (m,) with some fields (m, ...), all in one cell, for expressions that do not see where they are."""
+    """Return points (m,) with some fields (m, ...), all in one cell, for expressions independent of position."""
     count = len(next(iter(fields.values())))
     cells = np.zeros(count, dtype=np.int32)
     return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
 
 
 class Conductance:
-    """The integral of a law's relative permeability over the pressure, whose differences drive flow (Kirchhoff 1894).
+    """Integral of a law's relative permeability over the pressure, the potential of flow (Kirchhoff 1894).
 
-    A table over the logarithm of the suction, between whose rows the integral is a cubic with their values and slopes.
+    It is a table over the logarithm of the suction, with cubic Hermite interpolation between the rows.
 
     Parameters
     ----------
@@ -442,31 +441,31 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Suctions between which the table is, over the law's scale.  Source: exact beyond, but for as small a share."""
+"""Range of suctions of the table, over the law's scale.  Source: exact beyond, within an equally small fraction."""
 ROWS = 4000
 """Rows of the table.
 
 Plateau (dry): halved 2.1e-08, doubled 2.6e-09, cells 6.6e-03.
 """
 GAUSS = 8
-"""Points of integration between two rows.
+"""Quadrature points between two rows.
 
 Plateau (dry): halved 8.2e-10, doubled 1.5e-09, cells 6.6e-03.
 """
 
 
 def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return pressures (n,), Pa, on the scale on which a law of this `scale`, Pa, changes evenly: see `pressure_at`."""
+    """Return scaled pressures of (n,), Pa: logarithmic in the suction beyond `scale`, Pa; inverse of `pressure_at`."""
     return np.where(p < 0, np.arcsinh(p / scale), p / scale)
 
 
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pressures (n,), Pa, of such logarithms (n,)."""
+    """Return the pressures (n,), Pa, of values (n,) of `logarithm`."""
     return np.where(y < 0, scale * np.sinh(y), scale * y)
 
 
 FARTHEST = np.log(10)
-"""Change of the logarithm of the suction in a Newton step, at most; without one dry soil beside wet finds no solution.
+"""Largest change of the suction's logarithm in a Newton step; fronts into dry soil do not converge without it.
 
 Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
 
@@ -480,20 +479,20 @@ def restrained(
     scale: NDArray[np.float64] | float,
     went: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return by how much pressures p (n,) are to fall, Pa, where Newton's method asks for falls dp (n,).
+    """Return limited pressure decreases (n,), Pa, of a Newton step.
 
-    Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for the
-    saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  The logarithm of the suction
-    changes by at most `FARTHEST`, and where it turns back by half of what it has changed by: else it may go to and fro.
+    A step stops at the characteristic suction.  On each side of it the saturation is convex or concave, and Newton's
+    method converges (Wang and Tchelepi 2013).  The logarithm of the suction changes by at most `FARTHEST`.  A change in
+    the opposite direction is at most half of the change before, which prevents oscillations.
 
     Parameters
     ----------
     p, dp : (n,), Pa
-        Pressures, and falls that are asked for.
+        Pressures, and their decreases by Newton's method.
     scale : (n,), Pa
-        Suction about which pores drain.
+        Characteristic suction.
     went : (n,)
-        By how much their `logarithm` has changed in the step before.
+        Change of their `logarithm` in the step before.
     """
     there, turn = p - dp, -scale
     there = np.where((p - turn) * (there - turn) < 0, turn, there)

@@ -215,7 +215,7 @@ class Simulation:
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return an outcome of conditions at the end of the last step, by name: one of these, or a user's own."""
+        """Return outcomes of conditions at the end of the last step, by name; also of user-defined conditions."""
         return ByName(self.state.outcome.get(quantity, {}))
 
     @property

@@ -60,7 +60,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         *(_either(kind.title, number[kind.title], f"{number[kind.title]}", "none given") for kind in KINDS),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
-        _either("terms of the user's", m.own.terms, f"{len(m.own.terms)}", "none given"),
+        _either("user-defined terms", m.own.terms, f"{len(m.own.terms)}", "none given"),
     ]
 
 

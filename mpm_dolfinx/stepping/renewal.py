@@ -294,7 +294,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return those points that are kept (n,), and new ones."""
+    """Return the kept points (n,), and new ones."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The reference to compare with: body-fitted, total-Lagrangian finite elements for finite-strain Biot.
+"""Reference solution: body-fitted, total-Lagrangian finite elements for Biot's equations at finite strain.
 
 With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
 on the reference configuration of a box, from state n:
@@ -8,15 +8,14 @@ on the reference configuration of a box, from state n:
     storage    int rho [zeta(J, p) - zeta_n] q dV
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
-with tractions t, dead or pressures, and the mass m of soil and fluid.
-kappa = k/(rho_w g), the content zeta and the mass potential pi those of `fluid_content`, rho = exp((p + p_n)/(2 K_w)),
-the integral over the step that of `time_integration`.  Under suction kappa is k_r times it, and the change of the
-content S(p) of that at full pores, and that of S, see `retention`; full pores have chi = S = k_r = 1.
-With pressures constant in the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of
-the cells' centres; it is not consistent where the body shears.  k_r is then its mean over the pressures between the
-two cells.  In axisymmetry F has the hoops' stretch and integrals
-are those of the whole revolution.  Materials, retention, the user's terms and sources, and time
-integration are those of the material point method, so the two differ in discretisation only.
+with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), rho = exp((p + p_n)/(2 K_w)).
+`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil kappa is
+multiplied by k_r.  The content changes by S(p) times its change at saturation, plus the change of S, see `retention`;
+saturated pores have chi = S = k_r = 1.  With pressures constant in the cells the two-point flux is kappa J |F^-T N|^2
+(p+ - p-)/h, for a distance h of the cells' centres.  It is not consistent under shear.  k_r is then its mean over the
+pressures between the two cells.  In axisymmetry F contains the circumferential stretch, and integrals are over the
+whole revolution.  Materials, retention, user-defined terms and time integration are shared with the material point
+method.  The two methods differ in discretisation only.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.verification.pores import Pores
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
-CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
+CUT_DEGREE = 20  # of quadrature on a partly loaded side: the region's edge may cut facets
 
 
 class Space:
@@ -122,20 +121,20 @@ class BiotFEM:
         `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides, nodal pressures on whole facets of a region; other
         sides are free and sealed.
     pressure : Pa
-        Pore pressure at the start, or a function of places x (m, d), m.  Soil has no stress then, so loads have to
-        balance a pressure that is not zero, or its strain does.
+        Initial pore pressure, or a function of positions x (m, d), m.  The initial effective stress is zero: loads or
+        strains must balance the pressure.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity.
     terms
-        The user's, as those of `Simulation`, none on sides: see `user_functions`, `Source`.
+        User-defined terms as for `Simulation`, without terms on sides: see `user_functions`, `Source`.
         q is a test function of the pressure's elements.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
     numerics
-        Its method of time integration, and its tolerance: of the residual, relative to the loads or to the residual at
-        the start of a step.
+        Method of time integration, and tolerance of the residual, relative to the loads or to the residual at the start
+        of a step.
     axisymmetric
-        As that of `Grid`.
+        As for `Grid`.
     """
 
     def __init__(
@@ -180,7 +179,7 @@ class BiotFEM:
         self.grid = Grid(lower, upper, cells, axisymmetric=axisymmetric)
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
-        self._around = TURN * radius if axisymmetric else 1.0  # what measures in the plane count by
+        self._around = TURN * radius if axisymmetric else 1.0  # factor of measures in the plane
         self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
@@ -538,15 +537,15 @@ class BiotFEM:
         return len(norms) - 1, norms[-1] / scale
 
     def _free(self, x: PETSc.Vec) -> tuple[NDArray[np.float64], int]:
-        """Solve by SNES; return the norms of the residuals, and why it has ended."""
+        """Solve by SNES; return the norms of the residuals, and the reason of its end."""
         self._snes.solve(None, x)
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
-        """Solve as `_free`, by single steps whose pressures are within reach: see `retention.restrained`.
+        """Solve like `_free`, by single steps with limited pressure changes: see `retention.restrained`.
 
-        The slope of k_r, which where weight drives into dry soil turns the direction round, is left out (Celia,
-        Bouloutas and Zarba 1990) at first, and after a step that was out of reach or has raised the residual.
+        At first the tangent omits the slope of k_r (Celia, Bouloutas and Zarba 1990), also after a limited step and
+        after a rise of the residual.  With gravity and dry soil this slope can reverse the direction of the step.
         """
         snes, of_p = self._snes, self._space.p_dofs
         of_p = of_p[of_p < x.getLocalSize()]
@@ -644,7 +643,7 @@ class BiotFEM:
         return grid.comm.allreduce(out)
 
     def _row(self, x: NDArray[np.float64]) -> Row:
-        """Return what the histories hold of the present state."""
+        """Return the entries of the histories for the present state."""
         pressure = np.zeros(0)
         if self.fluid:
             p, comm = self.scale * self._space.w.x.array[self._space.p_dofs], self.grid.comm

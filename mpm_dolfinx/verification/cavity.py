@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Cylindrical cavities in soil, radial, at finite strain: a reference for laws and for scenes.
+"""Expansion of cylindrical cavities in soil at finite strain, in one dimension: a reference for laws and scenes.
 
-The hole has the radius 1; the soil begins in equilibrium with the same pressure inside and outside.
+The initial radius is 1, with equal pressures inside and outside.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class _Rings:
 
 @dataclass(frozen=True)
 class Cavity:
-    """A ring of soil in plane strain, linear elements with one point each, its hole widened, its outside pressed.
+    """A ring of soil in plane strain, with linear elements of one point each, under inner and outer pressure.
 
     rings: the law; R, r: radii of the nodes at the start and now; state: of the law; far: pressure outside, Pa;
     pressure: that in the hole, Pa.
@@ -75,7 +75,7 @@ class Cavity:
     pressure: float
 
     def widened(self, radius: float) -> Cavity:
-        """Return what becomes of the ring as its hole is widened to a radius in one step, drained."""
+        """Return the ring after a drained expansion of its hole to a radius in one step."""
         n, r = len(self.R), self.r.copy()
         r += (radius - r[0]) * r[0] / r  # as if incompressible
         r[0] = radius
@@ -119,11 +119,11 @@ def cavity(
     material
         The soil.
     outer
-        Outer radius over that of the hole; a hundred times and more stands for soil without end.
+        Outer radius over the radius of the hole; at least a hundred for infinite soil.
     elements
-        Over the ring, in geometric progression.
+        Number of elements, in geometric progression.
     state
-        What the law's state is at the start, if not that at rest.
+        Initial state of the law; by default at rest.
     """
     R, rings = np.geomspace(1, outer, elements + 1), _Rings(material, elements, state)
     far = -float(rings.kirchhoff(np.ones((elements, 2)), rings.start)[-1, 0])
@@ -133,8 +133,8 @@ def cavity(
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
     """Return the difference of total pressures over a ring, and the effective radial stress at its wall, Pa.
 
-    Radii follow from the constant volume, r^2 - a^2 = R^2 - 1, so that each ring is driven alone; radii: those of the
-    hole, in steps that are small.
+    Each element is independent: its radius follows from the constant volume, r^2 - a^2 = R^2 - 1.  radii: successive
+    radii of the hole, in small steps.
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Laboratory tests of a law at a single point: what a soil law is looked at with before it goes into a scene."""
+"""Laboratory tests of a law at a single point."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # of Newton's method; relative accuracy
 
 @dataclass(frozen=True)
 class ElementTest:
-    """What an element test measures, an entry a step, the first one at its start.
+    """Results of an element test, one entry a step; the first one is the start.
 
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.
     strain : (n,)
-        What is driven: logarithmic axial strain, compression positive; shear F_xy in shear; suction, Pa, in wetting.
+        Prescribed quantity: logarithmic axial strain, compression positive; in shear F_xy; in wetting suction, Pa.
     pressure : (n,), Pa
         Excess pore pressure: zero where drained.
     state
@@ -114,15 +114,14 @@ def element_test(
         normal stress, F_xx = F_zz = 1), "shear undrained" (simple, at constant volume), "wetting isotropic" and
         "wetting oedometer" (constant net stresses, along all axes or axial, without lateral strain).
     strain
-        Where it goes, or the turning points on the way: logarithmic axial strain, compression positive, in an
-        isotropic test of each axis; in shear F_xy; in wetting suctions, Pa, >= 0.
+        Final value, or successive turning points: logarithmic axial strain, compression positive, in an isotropic test
+        of each axis; in shear F_xy; in wetting suctions, Pa, >= 0.
     steps
         Equal steps to each turning point.
     confinement
-        Isotropic effective stress, Pa, >= 0, to which the soil is brought before, drained and slowly; 0: what its law
-        begins with.
+        Isotropic effective stress, Pa, >= 0, applied before the test, drained and slowly; 0: the law's initial stress.
     rate
-        Strain in a second, 1/s, > 0, of laws that depend on the time step.
+        Strain rate, 1/s, > 0, for rate-dependent laws.
     cell_size
         Size of the cells, m, > 0, of laws that depend on it.
     suction
@@ -131,9 +130,9 @@ def element_test(
     Raises
     ------
     ValueError
-        Naming what is not allowed.
+        An invalid argument.
     NotConverged
-        The law gives no such stress, however short the step.
+        The law does not reach the stress, even in short steps.
     """
     instance("material", material, Skeleton)
     if test not in KINDS:
@@ -163,7 +162,7 @@ def element_test(
         out.append(point.moved(out[-1], test, start, goal))
     states = {name: np.array([s.state[name] for s in out]) for name in material.state}
     F, stress = (np.array([getattr(s, name) for s in out]) for name in ("F", "stress"))
-    # undrained, the total stress on the cell's wall, and in shear the total normal stress, stays
+    # undrained: constant total stress on the cell's wall, in shear constant total normal stress
     pressure = (stress - stress[0])[:, 1, 1] * test.endswith("undrained")
     return ElementTest(F, stress, np.array([first, *path]), pressure, states)
 
@@ -215,11 +214,11 @@ class _Point:
         return _At(F, self._stress(F[None], before.state, dt)[0], strain, before.state | new)
 
     def at_rest(self) -> _At:
-        """Return the soil as its law begins."""
+        """Return the initial state of the law."""
         return _At(np.eye(3), self._stress(np.eye(3)[None], self._rest)[0], 0.0, self._rest)
 
     def compressed(self, confinement: float) -> _At:
-        """Return the soil under an isotropic effective stress, Pa, to which its law is brought in steps."""
+        """Return the soil after loading in steps to an isotropic effective stress, Pa."""
         at = self.at_rest()
         first = -np.trace(at.stress) / 3
         for share in np.linspace(0, 1, 21)[1:]:
@@ -228,7 +227,7 @@ class _Point:
         return at
 
     def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
-        """Return the soil after a strain is reached, from a state at another; steps that fail are halved."""
+        """Return the soil at a new strain; failed steps are halved."""
         parts, done = [strain], 0
         while parts:
             try:
@@ -261,7 +260,7 @@ class _Point:
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
-        """Return the soil at another suction, Pa, where the free components of the net stress stay."""
+        """Return the soil at another suction, Pa, with constant free components of the net stress."""
         m = self._material
         felt, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
         goal = [start.stress[i] + before - felt for i in free]
@@ -271,7 +270,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the soil after dt, s, where the free components of F give Cauchy stresses their goal, Pa."""
+        """Return the soil after dt, s; free components of F are solved for Cauchy stresses equal to the goal, Pa."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T
@@ -289,4 +288,4 @@ class _Point:
             slope = (found[1::2] - found[2::2]).T / (2 * CENTRAL)
             step = np.linalg.lstsq(slope, error, rcond=ROUND_OFF)[0]
             F[rows, columns] -= step
-        raise NotConverged(f"element test: no stretch gives the lateral stress at a strain of {strain:g}")
+        raise NotConverged(f"element test: no stretch is found for the prescribed stress at a strain of {strain:g}")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Exact solutions that results can be compared with: consolidation, columns, beams and rods.  No dolfinx.
+"""Exact solutions for comparison: consolidation, columns, beams and rods.  No dolfinx.
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  Times are
-reduced to T = c_v t / length².  The series of exponentials converges slowly for small T; below `SWITCH`
-the Laplace transform, with tanh X, coth X -> 1 for X = sqrt(s), is inverted in closed form instead.  What
-either leaves out is of the order of erfc(1/sqrt(T)) < 2e-23 or less: both are exact to round-off.
+reduced to T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a
+closed inverse of the Laplace transform is used, with tanh X, coth X -> 1 for X = sqrt(s).  The error of
+either is of the order of erfc(1/sqrt(T)) < 2e-23 or less: both are exact to round-off.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
 def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
     """Return the degree of consolidation: settlement since t = 0+ over its final value.
 
-    The parameters are those of `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
+    Parameters as for `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
     Returns (...), in (0, 1]. Source: Terzaghi (1923); Verruijt.
     """
     _positive(height=height, cv=cv, t=t)
@@ -99,7 +99,7 @@ class Mandel:
 
     Parameters
     ----------
-    a, b : m, > 0; width and height of the quarter, half of those of the slab
+    a, b : m, > 0; width and height of the quarter, half of the slab's
     bulk, shear : Pa, > 0; drained moduli K and G (K of three dimensions)
     mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
     storage : 1/Pa, >= 0; S at constant strain, n/K_w + (alpha - n)/K_s
@@ -273,7 +273,7 @@ class SelfWeightColumn:
         return np.exp(-self._shortening(Y))
 
     def position(self, Y: ArrayLike) -> Array:
-        """Return the heights (...), m, now of what was at Y (...), m, in [0, l0]. Source: integral of the stretch."""
+        """Return the heights (...), m, of points with reference Y (...), m, in [0, l0]. Source: integral of stretch."""
         foot, w = self._shortening(0.0), self._shortening(Y)
         return self.l0 * (foot - w) * (1 + (foot + w) / 2) / (foot * np.exp(foot))
 
