@@ -28,13 +28,14 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
 
 NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes"
 NAMES = NAMES.split()
-SCENES = [f"mpi_{name}.py" for name in NAMES] + [pytest.param("mpi_wetting.py", marks=pytest.mark.slow)]
+SCENES = [(f"mpi_{name}.py", (3,)) for name in NAMES]
+SLOW = [
+    pytest.param(f"mpi_{name}.py", count, marks=pytest.mark.slow)
+    for name, count in (("wetting", (3,)), ("rain", (2, 3, 4)))
+]
 
 
-@pytest.mark.parametrize(
-    "scene, several",
-    [*((scene, (3,)) for scene in SCENES), pytest.param("mpi_rain.py", (2, 3, 4), marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("scene, several", SCENES + SLOW)
 def test_the_state_is_the_same_on_several_processes(scene, several, tmp_path):
     states = []
     for processes in (1, *several):
