@@ -360,7 +360,7 @@ def test_one_line_says_what_is_wrong(change, message):
 
 def test_it_needs_a_law_of_retention_and_suctions_that_are_none():
     dry = replace(SOIL, retention=None)
-    with pytest.raises(ValueError, match="BarcelonaBasic: retention = None, must be a law of retention"):
+    with pytest.raises(ValueError, match="BarcelonaBasic: retention = None, must be a retention curve"):
         narrow(dry, 2, 0.0)
     with pytest.raises(ValueError, match="BarcelonaBasic: retention = None, must be a law of retention in wetting"):
         element_test(dry, "wetting isotropic", 0.0, suction=S0)

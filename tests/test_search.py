@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import newton, search
+from mpm_dolfinx.solve import line_search as search
+from mpm_dolfinx.solve import newton
+from mpm_dolfinx.solve.line_search import EXPLODES, SHORTEST, WORK, Halving, Search
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.solve.search import EXPLODES, SHORTEST, WORK, Halving, Search
 from mpm_dolfinx.stepping import balances
 
 

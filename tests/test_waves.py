@@ -216,7 +216,7 @@ def test_a_side_of_moving_bodies_does_not_become_quiet():
 @pytest.mark.parametrize(
     ("given", "names"),
     [
-        (([[0, 1], [0, 2]], (1, 0)), "increase"),
+        (([[0, 1], [0, 2]], (1, 0)), "increasing"),
         (([[0, 1]], (1, 0)), "two columns"),
         (([[0, 1], [1, np.nan]], (1, 0)), "finite"),
         (([[0, 1], [1, 2]], (1,)), "direction"),

@@ -234,7 +234,7 @@ class CompiledForm:
 def _mesh_of(form: ufl.Form):
     if OLD:
         return form.ufl_domain().ufl_cargo()
-    spaces = [a.ufl_function_space() for a in form.arguments()]
+    spaces = [a.ufl_function_space() for a in (*form.arguments(), *form.coefficients())]
     return spaces[0].mesh
 
 

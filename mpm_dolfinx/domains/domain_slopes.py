@@ -178,7 +178,7 @@ def _slopes(
     faces = [corners[bits[:, a] == end].mean(axis=0) for a in range(d) for end in (0, 1)]
     edges = np.stack([faces[2 * a + 1] - faces[2 * a] for a in range(d)], axis=1)
     inverse = _inverse(edges)
-    own = np.concatenate([F.reshape(len(F), -1)[rows].T, corners.mean(axis=0), alike[rows].T])
+    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.mean(axis=0), alike[rows].T])
     others = neighbours.elsewhere(own, faces)
     nearest = NEAR * np.abs(edges).sum(axis=0).min(axis=0)
     A, B = np.zeros((d, d, len(rows))), np.zeros((d, k * k, len(rows)))

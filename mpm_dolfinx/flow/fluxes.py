@@ -3,7 +3,8 @@
 
 The contents of the cells are coefficients of the forms, set at each grid reset.  In a moving body the fluxes through
 the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the material in a
-cell, its mobility kappa becomes J F^-1 kappa F^-T.
+cell, its mobility kappa becomes J F^-1 kappa F^-T.  Fluxes through open sides are in `drained_sides`; `StorageProblem`
+in `storage` sums both.
 """
 
 from __future__ import annotations

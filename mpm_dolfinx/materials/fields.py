@@ -443,7 +443,8 @@ class SceneMaterials:
 
     def alike(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return rows (n, c) that are equal at points of the same elastic soil, whatever its initial stress."""
-        fields = [points.data[name].reshape(len(points), -1) for name in self.field_names if name != "seeded_stretch"]
+        fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
+        fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
 
     @property

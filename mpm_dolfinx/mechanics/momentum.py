@@ -40,8 +40,8 @@ from mpm_dolfinx.mechanics.dried import OfSuction
 from mpm_dolfinx.mechanics.ghost_penalty import GhostPenalty
 from mpm_dolfinx.mechanics.inertia import InertiaForms
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
-from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
 from mpm_dolfinx.pores.retention import Retentions

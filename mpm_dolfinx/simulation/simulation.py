@@ -35,7 +35,7 @@ from mpm_dolfinx.stepping.initial_state import balanced
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked
-from mpm_dolfinx.stepping.stages import begin_stage, first_state
+from mpm_dolfinx.stepping.stage_changes import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Lengths of the steps of a run: equal steps, or adaptive steps from their estimated error."""
+"""Lengths of the steps of a run: equal steps, or adaptive steps from their estimated error.
+
+The estimates are `note_pressures` in `solve/newton.py`, `filling` in `flow/storage.py` for the water content, and
+`dynamics/motion_error.py`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.step_control import StepControl
+from mpm_dolfinx.stepping.step_memory import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Smallest cut step relative to the nominal step: equal steps, adaptive steps.

@@ -36,7 +36,7 @@ from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.step_control import StepControl
+from mpm_dolfinx.stepping.step_memory import StepControl
 
 PARTS = (
     "cut domains",

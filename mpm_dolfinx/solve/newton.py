@@ -37,8 +37,8 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.factors import negative_pivots
+from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
-from mpm_dolfinx.solve.search import FIRM, Halving, Search
 
 INNER = 1e-3  # momentum tolerance over the storage error: unconverged rotations cause spurious volume changes
 MOMENTUM_STEPS = 10

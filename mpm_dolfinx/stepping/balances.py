@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome, Shares
-from mpm_dolfinx.dynamics.step_error import motion_error
+from mpm_dolfinx.dynamics.motion_error import motion_error
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.inertia import Flight, Inertia
 from mpm_dolfinx.mechanics.momentum import MomentumProblem

@@ -35,7 +35,7 @@ from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
-from mpm_dolfinx.dynamics.quiet import QuietSides
+from mpm_dolfinx.dynamics.quiet_sides import QuietSides
 from mpm_dolfinx.flow.drained_sides import DrainedSides
 from mpm_dolfinx.flow.feeding import Feeding
 from mpm_dolfinx.grid.grid import SIDES, Grid

@@ -19,7 +19,7 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints, PlacedPoints
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
-from mpm_dolfinx.stepping.step_control import StepControl
+from mpm_dolfinx.stepping.step_memory import StepControl
 
 
 def _freeze(kept: Mapping[str, Any]) -> None:
@@ -59,7 +59,7 @@ class Stay:
 class State:
     """The complete memory of a scene between two steps; immutable. A step makes a new one.
 
-    A checkpoint holds all of it but the stage, which the script defines.
+    A checkpoint holds all of it but the stage, which the script defines, and the watched points, which a run sets anew.
 
     t
         Time, s.

@@ -24,7 +24,7 @@ from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.dynamics.at_rest import borne
-from mpm_dolfinx.dynamics.quiet import QuietSides, traction_name
+from mpm_dolfinx.dynamics.quiet_sides import QuietSides, traction_name
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.mechanics.inertia import resting

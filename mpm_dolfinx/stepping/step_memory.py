@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The memory of the step-size rule between two steps."""
+"""The memory of the step-size rule of `simulation/step_size.py` between two steps."""
 
 from __future__ import annotations
 

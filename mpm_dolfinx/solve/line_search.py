@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Line search: the length of a Newton step.
+"""Line search: the length of a Newton step, see `Newton._line_search`.
 
 Without yield the step is full, even if the residual grows: rotations of a bending body cause a spurious stretch at
 first order. It is halved while a law cannot be evaluated at its end, or the residual explodes.
