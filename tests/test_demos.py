@@ -50,7 +50,7 @@ QUICK = {
     "falling": ("--cells 3 --dt 0.02", ["falling.png"]),
     "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
     "drainage": ("--cells 10 --step 120", ["drainage.png"]),
-    "rain": ("--cells 10 --step 7200 --slope 0", ["rain.png"]),
+    "rain": ("--cells 10 --step 7200", ["rain.png"]),
     "water_table": ("--h 0.25 --step 1800", ["water_table.png"]),
     "vibration": ("--h 0.1 --cells 8 --periods 1 --steps 16", ["vibration.png"]),
     "wave": ("--cells 8 --steps 10 --periods 2", ["wave.png"]),
