@@ -98,7 +98,7 @@ def slide(o: Namespace) -> dict:
         s.run(s.t + 0.25, 0.025)
         speeds.append(float(np.linalg.norm(s.points.data["velocity"], axis=1).max()))
     mpm.plot(s, "saturation", ax=axes[2], clim=(0.2, 1.0))
-    for ax, title in zip(axes, ("before the storm", f"{failed:.0f} s: it fails", "2 s later, at rest"), strict=True):
+    for ax, title in zip(axes, ("before the storm", f"{failed:.0f} s: it fails", "2 s later"), strict=True):
         ax.set(title=title, xlim=(0, 2.5), ylim=(0, 1.15))
     common.save(fig, o.out / "rain_slide.png")
     came = -s.outcome("flowed").array.sum()
@@ -160,7 +160,7 @@ def main(argv: list[str] | None = None) -> dict:
             out |= (found_of := slide(o))
             print(
                 f"the bank fails after {found_of['failed']:.0f} s, slides at up to {max(found_of['speeds']):.2f} m/s, "
-                f"and lies at rest {found_of['run_out']:.2f} m further (last speed {found_of['speeds'][-1]:.3f} m/s); "
+                f"and lies {found_of['run_out']:.2f} m further (last speed {found_of['speeds'][-1]:.3f} m/s); "
                 f"its water is balanced to {found_of['water']:.1e}"
             )
     return out
