@@ -73,20 +73,19 @@ class Neighbours:
 
         own (c, k): columns of these points; faces: centres (d, k), m, of each of their faces.
         """
-        count = own.shape[1]
+        centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
+        point = np.repeat(np.arange(own.shape[1]), len(faces))
         if self._to_home.comm.size > 1:
-            point, face = np.divmod(self._lone, len(faces))
-            rows = np.concatenate([own[:, point], np.stack(faces, axis=2)[:, point, face]])
+            rows = np.concatenate([own[:, point[self._lone]], centres[:, self._lone]])
             away = self._to_home.back(self._to_home.send(rows.T.copy())[self._there]).T
-            own = np.concatenate([own, away[: len(own)]], axis=1)
-            centres = np.concatenate([np.stack(faces, axis=2).reshape(len(faces[0]), -1), away[len(own) :]], axis=1)
-        else:
-            centres = np.stack(faces, axis=2).reshape(len(faces[0]), -1)
+            point = np.append(point, own.shape[1] + np.arange(len(self._lone)))
+            own, centres = (
+                np.concatenate(pair, axis=1) for pair in zip((own, centres), np.split(away, [len(own)]), strict=True)
+            )
 
         def of(face: int) -> tuple[NDArray, NDArray, NDArray]:
             at = self._partner[face]
-            point = np.where(at < count * len(faces), at // len(faces), at - count * (len(faces) - 1))
-            return own[:, point], centres[:, at], at >= 0
+            return own[:, point[at]], centres[:, at], at >= 0
 
         return of
 

@@ -57,8 +57,7 @@ class Borders:
             self.mixed[mixed.cells] = np.arange(len(mixed.cells))
             known[mixed.cells, 0] = 1.0
         known = with_ghosts(grid.cellwise(), known)
-        self._place = np.zeros(grid.num_local, dtype=np.int64)
-        self._place[contents.filled] = np.arange(len(contents.filled))
+        self._contents = contents
         self._law = known[:, 1].astype(np.int64)
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
@@ -140,7 +139,7 @@ class Borders:
         if not len(rows):
             return
         mixed, count = self.mixed[cells[rows]], len(rows)
-        slot = self._place[cells[rows]]
+        slot = self._contents.slot(cells[rows])
         share = normal[rows] ** 2
         across = mobility.mean[slot] * (share * mobility.share[slot]).sum(axis=1)
         found, ones = np.zeros((2, count)), np.ones(count)

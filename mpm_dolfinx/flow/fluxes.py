@@ -226,13 +226,12 @@ class CellContents(Keyed):
         Contributions of the pieces.
     filled
         Owned active cells.
-    active
-        Owned active cells and active ghosts.
     """
 
-    def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64], active: NDArray[np.int64]):
+    def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
         self.grid = grid = forms.grid
-        self.active = active
+        self.active = active = forms.active.cells
+        """Owned active cells and active ghosts."""
         self.filled = filled
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))

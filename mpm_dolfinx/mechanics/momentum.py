@@ -280,8 +280,6 @@ class MomentumSystem:
         The forms.
     dofs
         Unrolled local degrees of freedom that are unknowns, ghosts included.
-    nodes
-        Active local nodes, ghosts included.
     cells
         Active cells of this process.
     facets
@@ -296,19 +294,17 @@ class MomentumSystem:
         self,
         forms: MomentumForms,
         dofs: NDArray[np.int64],
-        nodes: NDArray[np.int64],
         cells: NDArray[np.int32],
         facets: NDArray[np.int32],
         stiff: bool,
         parts: Parts,
     ):
         self._forms, d = forms, forms.grid.dim
-        self._nodes = nodes
         self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
         self.locks = forms.dilatation is not None
         """Whether some law takes F-bar: it yields, or is nearly incompressible."""
-        owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
-        self.touched = (owned[:, None] * d + np.arange(d)).ravel()
+        active = forms.active.dofs
+        self.touched = active[active < d * forms.u.function_space.dofmap.index_map.size_local]
         """Degrees of freedom on which forces may act, fixed or free."""
         self.parts, comm = parts, forms.grid.comm
         self.of_parts, self._touched = (
@@ -319,13 +315,13 @@ class MomentumSystem:
         """Rounding error of the residual at each unknown, N."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
-        every = (nodes[:, None] * d + np.arange(d)).ravel()
-        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs), forms.grid.node_x)
+        held = np.setdiff1d(active, dofs)
+        self.held = Unknowns(forms.u, held, forms.grid.node_x)
         """Degrees of freedom that walls of the grid fix."""
         self.held_residual = self.held.vector()
         self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
         at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
-        at_walls[np.setdiff1d(every, dofs) // d] = True
+        at_walls[held // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
         self._ghost = forms.ghost.on(facets, facets[near])
         self.firm, self._firmness = None, None  # without laws that yield
@@ -343,7 +339,9 @@ class MomentumSystem:
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
         """Set the rounding error of the residual at the active local nodes, N."""
-        self.rounding.array_w[:] = nodes[np.searchsorted(self._nodes, self.unknowns.owned // self.unknowns.dim)]
+        self.rounding.array_w[:] = nodes[
+            np.searchsorted(self._forms.active.nodes, self.unknowns.owned // self.unknowns.dim)
+        ]
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], ...] | None:

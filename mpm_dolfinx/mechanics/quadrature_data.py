@@ -175,10 +175,10 @@ class QuadraturePoints:
 
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
         """Return the integration points of a cut with all their data, from the present points."""
-        changing = {name: cut.to_cells(values) for name, values in self._changing(points).items()}
-        if self._linear is not None and cut.domains:
-            changing |= {name: cut.pieces_to_cells(values) for name, values in self._gradients(cut, points).items()}
-        fields = {**self._constant(cut, points), **changing, **self._own(cut, points)}
+        within = self._gradients(cut, points) if self._linear is not None and cut.domains else {}
+        even = {name: values for name, values in self._changing(points).items() if name not in within}
+        fields = {**self._constant(cut, points), **{name: cut.to_cells(values) for name, values in even.items()}}
+        fields |= {name: cut.pieces_to_cells(values) for name, values in within.items()} | self._own(cut, points)
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         if self._locks and cut.domains:

@@ -114,7 +114,7 @@ class OnGrid(Keyed):
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
-            self.contents = CellContents(storage.fluxes, brought, own, self.cells)
+            self.contents = CellContents(storage.fluxes, brought, own)
             if quadrature.materials.retentions is not None:
                 lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
                 self._places = replace(self._places, lever=lever)
@@ -450,8 +450,8 @@ class System:
         Coupling scheme.
     on_grid
         The bodies on the grid.
-    dofs, nodes
-        Unrolled local unknowns of the displacement, and active nodes.
+    dofs
+        Unrolled local unknowns of the displacement.
     stiff
         Whether plates or prescribed displacements have a penalty.
     symmetric
@@ -465,7 +465,6 @@ class System:
         scheme: Scheme,
         on_grid: OnGrid,
         dofs: NDArray[np.int64],
-        nodes: NDArray[np.int64],
         stiff: bool,
         symmetric: bool,
     ):
@@ -473,7 +472,7 @@ class System:
         self.symmetric = symmetric
         self.storage = None
         own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(*on_grid.parts_of_cells)
-        self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
+        self.momentum = MomentumSystem(momentum, dofs, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
@@ -648,14 +647,13 @@ def assembled(
         A body, or at the start of a stage a part of one, has a free rigid-body mode.
     """
     grid, free = on_grid.cut.grid, stage.free
-    nodes = momentum.active.nodes
-    dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
+    dofs = momentum.active.dofs[free[momentum.active.nodes].ravel()]
     stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
 
     def make() -> System:
         if not stage.inertia and not any(one.holding for one in loads):
             check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
-        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, symmetric)
+        return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
