@@ -232,12 +232,13 @@ class MomentumForms:
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (nodes,) at the active local nodes of values (cells,) of owned cells, over all processes."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
-        nodes, at = np.unique(self.grid.cell_nodes[cells], return_inverse=True)
+        nodes = self.active.now.nodes
+        at = nodes.searchsorted(self.grid.cell_nodes[cells])
         values_at[self.active.now.dofs] = 0.0
         values_at[nodes * d] = sum_by(at.ravel(), values.repeat(2**d), len(nodes))
         sum_ghosts(shared)
         shared.x.scatter_forward()
-        return values_at[self.active.now.nodes * d]
+        return values_at[nodes * d]
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
         """Return the connected parts of the bodies in active cells, from the parts of the cells: see `parts_of_cells`.

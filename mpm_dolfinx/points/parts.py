@@ -52,9 +52,9 @@ class OfParts:
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Order of the entries by parts, first place of each part in it, and the parts with entries."""
-        present = np.unique(self.of)
-        order = self.of.argsort(kind="stable")
-        return order, self.of[order].searchsorted(present), present
+        sizes = np.bincount(self.of, minlength=self.count)
+        present = sizes.nonzero()[0]
+        return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
 
     def sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., count) of entries (..., n) over each part, of all processes."""
