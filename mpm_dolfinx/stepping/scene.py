@@ -40,6 +40,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.moving_lines import with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
@@ -237,7 +238,12 @@ class Scene:
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
 
-        return self._on_grid(points.arrays, make, grid.comm)
+        lines = () if grid.follow is None else grid.lines
+        return self._on_grid((points.arrays, lines), make, grid.comm)
+
+    def followed(self, state: State) -> State:
+        """Return the state for its next step, with the lines of that step, on which the grid is put."""
+        return with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
 
     @cached_property
     def _renewal(self) -> Renewal | None:
@@ -310,7 +316,7 @@ class Scene:
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         if not grid.even:
-            out |= {f"grid lines along {letter}": x.tolist() for letter, x in zip("xyz", grid.lines, strict=False)}
+            out |= {f"grid lines along {letter}": x.tolist() for letter, x in zip("xyz", grid.seeded, strict=False)}
         out |= {"quadrature": self.numerics.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
         if grid.copies > 1:
             first = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
