@@ -49,7 +49,9 @@ def lines_at(
         raise ValueError(f"{what}: {' and '.join(str(len(of)) for of in out)} lines, must be {allowed}")
     for letter, new, old in zip("xyz", out, given, strict=False):
         if np.abs(new - old)[[0, -1]].max() > rounding(old):
-            raise ValueError(f"{what}: lines along {letter} from {new[0]} to {new[-1]} m, must be {old[0]} to {old[-1]}")
+            raise ValueError(
+                f"{what}: lines along {letter} from {new[0]} to {new[-1]} m, must be {old[0]} to {old[-1]}"
+            )
         new[[0, -1]] = old[[0, -1]]
     return out
 

@@ -660,7 +660,7 @@ class GridOfGroups(Grid):
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):
-        super().__init__(grid.lower, grid.upper, grid.shape, grid.comm)
+        super().__init__(**grid.given, comm=grid.comm)
         self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"

@@ -15,7 +15,7 @@ from mpm_dolfinx.base.validation import takes
 from mpm_dolfinx.domains.cut_domains import STAYS
 from mpm_dolfinx.grid.following import carried, lines_at
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.state import State
 
 
@@ -29,13 +29,14 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     left
         Returns a state whose points all stay, without its kept cut; called with the grid on the state's lines.
     """
-    if grid.follow is None:
-        return state
     before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
     grid.move(before)
     lines = _wanted(grid, state, before)
     if state.stay is not None:
-        moved = [np.abs(new - old)[1:-1] / np.minimum(np.diff(old)[1:], np.diff(old)[:-1]) for new, old in zip(lines, before, strict=True)]
+        moved = [
+            np.abs(new - old)[1:-1] / np.minimum(np.diff(old)[1:], np.diff(old)[:-1])
+            for new, old in zip(lines, before, strict=True)
+        ]
         if max(far.max(initial=0.0) for far in moved) <= STAYS:
             lines = before
         else:
@@ -55,7 +56,9 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
                 return carried(grid.seeded, way)
         return before
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
-    lines = grid.from_base(lines_at(grid.follow, [x + start for x, start in zip(grid.seeded, grid.base, strict=True)], state.t, x))
+    lines = grid.from_base(
+        lines_at(grid.follow, [x + start for x, start in zip(grid.seeded, grid.base, strict=True)], state.t, x)
+    )
     ends = [over_all(grid.comm, np.concatenate(lines), op) for op in (MPI.MIN, MPI.MAX)]
     if (ends[0] != ends[1]).any():
         raise ValueError(f"grid: follow at t = {state.t:g} s: lines differ between processes, must be equal on all")

@@ -243,7 +243,11 @@ class Scene:
 
     def followed(self, state: State) -> State:
         """Return the state for its next step, with the lines of that step, on which the grid is put."""
-        return with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
+        if self.grid.follow is None:
+            return state
+        state = with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
+        self.materials.check_cells()
+        return state
 
     @cached_property
     def _renewal(self) -> Renewal | None:
