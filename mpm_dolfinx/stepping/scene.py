@@ -273,8 +273,10 @@ class Scene:
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
 
-        renew: whether renewal is allowed.
+        renew: whether renewal is allowed. A state whose points all stay is returned as it is.
         """
+        if state.stays:
+            return state, 0
         if self._renewal is None or not renew:
             return state.at_owners(self.grid), 0
 
