@@ -250,7 +250,8 @@ def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))
     found = f"alpha = {alpha:g}, lines that follow: N = {N:.3f} in {count} cells, {beside:.3f} in {whole} equal cells"
     print(f"{found}; {run.cuts} of {run.steps} steps cut", flush=True)
-    fig, axes = common.figure(1, 2, (12, 7))
+    fig, grid = common.figure(1, 2, (12, 7))
+    axes = grid.ravel()
     for each, name in ((equal, f"{whole} equal cells"), (run, f"{count} cells that follow")):
         axes[0].plot(each.depth, each.N, label=name)
     axes[0].axhline(exact(alpha), color="k", ls="--", lw=0.8)

@@ -258,7 +258,6 @@ class Scene:
         has = {
             "is in 3D": grid.dim == 3,
             "is axisymmetric": grid.axisymmetric,
-            "has cells of many sizes": not grid.even,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
             "has inertia": self.momentum.inertia is not None,
@@ -267,7 +266,7 @@ class Scene:
         }
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
-            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain on equal cells")
+            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain")
         return Renewal(grid, self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
