@@ -191,3 +191,22 @@ def step(follow, lines=LINES):
 )
 def test_lines_that_cannot_follow_are_refused_in_one_line(make, name, value):
     refused_in_one_line(make, name, value, None, 300)
+
+
+@pytest.mark.slow
+def test_a_cone_meets_the_force_that_it_meets_in_lines_that_are_fine_all_along_its_way():
+    """Blunt, rough, from the surface of clay by two cells, in axisymmetry: the mean over the second half of the way."""
+    clay, h, way, wide = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3), 0.1, 0.2, 0.6
+    forces = []
+    for follow in (False, True):
+        cone = mpm.Tool(mpm.Cone((0, 2.0), (0, 1), 60.0), lambda t: (0, -t), adhesion=300.0)
+        zone = [[0, 2 - wide - (0 if follow else way)], [wide, 2 + wide]]
+        more = {"follow": cone} if follow else {}
+        grid = mpm.Grid(lines=mpm.graded([0, 0], [2, 3], [zone], h, 1.3), axisymmetric=True, **more)
+        body = mpm.box(mpm.Grid([0, 0], [2, 3], [20, 30], axisymmetric=True), [0, 0], [2, 2])
+        walls = {"left": "x", "right": "x", "bottom": "y"}
+        s = mpm.Simulation(grid, [body], [clay], walls=walls, conditions=[cone])
+        result = s.run(way, h / 6, progress=False)
+        forces.append(-result.tool_forces["tool"][1:, 1])
+    mean = [force[len(force) // 2 :].mean() for force in forces]
+    assert mean[1] == pytest.approx(mean[0], rel=0.01), forces
