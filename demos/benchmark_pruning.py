@@ -54,12 +54,13 @@ def block(
     box: float = 1.0,
     from_mesh: bool = False,
     axisymmetric: bool = False,
+    grid: mpm.Grid | None = None,
     **options,
 ) -> mpm.Simulation:
-    """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
+    """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it, unless given."""
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
-    grid = mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
+    grid = grid or mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
     conditions = options.pop("conditions", [])
     if not any(isinstance(one, (mpm.Traction, mpm.Pressure)) for one in conditions):
         conditions = [mpm.Traction("top", lambda t: (0, -LOAD * t)), *conditions]
@@ -93,6 +94,18 @@ def restless(cells: int, **options) -> mpm.Simulation:
     motion = simulation.scene.motion
     motion.advanced = partial(motion.advanced, stays=False)
     return simulation
+
+
+def of_many_sizes(cells: int, moves: bool) -> mpm.Simulation:
+    """Return the block with the grid reset in each step, in cells of two sizes; moves: whether its lines swing."""
+
+    def lines(t: float) -> list[np.ndarray]:
+        even = [np.linspace(0, end, n + 1) for end, n in ((1, cells), (1 + 2 / cells, cells + 2))]
+        for x in even:
+            x[1:-1:2] += (0.1 + 0.01 * np.sin(t)) / cells
+        return even
+
+    return restless(cells, grid=mpm.Grid(lines=lines(0.0), follow=lines if moves else None))
 
 
 def refactorised(cells: int) -> mpm.Simulation:
@@ -242,6 +255,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),
     "grid reset in each step": (block, restless),
+    "grid lines that move": (partial(of_many_sizes, moves=False), partial(of_many_sizes, moves=True)),
     "body from a mesh": (block, lambda n: block(n, from_mesh=True)),
     "axisymmetry": (
         lambda n: restless(n, material=soil(conductivity=1e-4), **WATER),

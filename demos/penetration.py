@@ -18,6 +18,9 @@ lower then.  Errors refer to the mean of N over the last part of each quarter, a
 Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v.  Water of the same pressure
 stands on top, so the clay starts without effective stress.  It is seeded once.  The domains ahead of the bar are
 narrower at first, by their later stretch, and end as wide as the others.
+
+With --follow the bar is pushed once more, through small cells that move with it.  Grid lines follow the bar: their
+number stays, and the cells around the small ones widen behind the bar and narrow ahead of it.
 """
 
 from __future__ import annotations
@@ -49,6 +52,7 @@ CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-2}  # V
 SETTLED = 1e-3  # of the push's time: that in which the pressure comes
 BALANCE = 1e-8  # relative error of the fluid balance that is allowed
+FINE_ZONE, RATIO = 1.0, 1.3  # m around the bar with small cells that follow it; ratio of the cells beyond
 
 
 def exact(alpha: float) -> float:
@@ -68,11 +72,17 @@ def angles(around: int, nose: float) -> np.ndarray:
     return np.concatenate([np.linspace(0, near[-1], PARTS + 1)[:-1], near[:0:-1], even[PARTS:]])
 
 
-def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
-    """Return a grid by its cells over the diameter, half of the block around a bar at y, m, and its top's region."""
+def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
+    """Return a grid by its cells over the diameter, half of the block around a bar at y, m, and its top's region.
+
+    follow: the bar, for lines that follow it.
+    """
     h = D / cells
     n = round(HALF * cells)
-    grid = mpm.Grid([0, -HALF], [HALF, HALF + 4 * h], [n, 2 * n + 4])
+    even = grid = mpm.Grid([0, -HALF], [HALF, HALF + 4 * h], [n, 2 * n + 4])
+    if follow is not None:
+        zone = [[0, y - FINE_ZONE], [FINE_ZONE, y + FINE_ZONE]]
+        grid = mpm.Grid(lines=mpm.graded(even.lower, even.upper, [zone], h, RATIO), follow=follow)
     around, outward = 4 * round(np.pi * D / 2 / (FINE * h) / 4), round(np.log(2 * HALF / D) * D / 2 / (FINE * h))
     corners = [0, np.arctan2(HALF, HALF + y), np.pi - np.arctan2(HALF, HALF - y), np.pi]
     at = np.interp(angles(around, nose), np.pi * np.array([0, 1, 3, 4]) / 4, corners)
@@ -86,7 +96,7 @@ def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
         reach = 1 / np.maximum(e[:, 0] / HALF, np.abs(e[:, 1]) / np.where(e[:, 1] > 0, HALF - y, HALF + y))
         return e * (D / 2 * (2 * reach / D) ** (X[:, 0] / size[0]))[:, None] + [0, y]
 
-    return grid, mpm.mapped(grid, mpm.box(grid, [0, -HALF], size - [0, HALF]), ring), top
+    return grid, mpm.mapped(grid, mpm.box(even, [0, -HALF], size - [0, HALF]), ring), top
 
 
 @dataclass
@@ -95,6 +105,7 @@ class Push:
 
     frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
     motion of the points over that of the bar since the clay was seeded, or the excess pressure of wet clay over s_u.
+    lines: then, along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -102,24 +113,29 @@ class Push:
     steady: list[bool] = field(default_factory=list)
     excess: list[float] = field(default_factory=list)
     frame: tuple = ()
+    lines: tuple = ()
     steps: int = 0
     cuts: int = 0
     balance: float = 0.0
 
 
-def push(alpha: float, cells: int, depth: float) -> Push:
-    """Press the clay, then push a bar of roughness alpha to a depth, over D, with clay seeded again in each part."""
+def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
+    """Press the clay, then push a bar of roughness alpha to a depth, over D, with clay seeded again in each part.
+
+    follow: whether grid lines follow the bar.
+    """
     out, stress, legs = Push(), None, max(1, round(depth / LEG))
     for k in range(legs):
-        stress = leg(out, stress, alpha, cells, depth * (0.5 - k / legs), depth / legs)
+        stress = leg(out, stress, alpha, cells, depth * (0.5 - k / legs), depth / legs, follow)
     return out
 
 
-def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float) -> Callable:
+def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
     """Push a bar at y over D by a way, over D, from stresses or after pressing the clay; return the stresses then."""
-    (grid, body, top), begin, gone = clay(cells, y=y * D), 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
+    begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
+    grid, body, top = clay(cells, y=y * D, follow=bar if follow else None)
     load = mpm.Pressure("right", lambda t: PRESSURE * (min(1, t) if begin else 1), region=top)
     acting = {"walls": WALLS, "conditions": [load, bar], "initial_stress": stress}
     simulation = mpm.Simulation(grid, [body], [soil], **acting)
@@ -135,6 +151,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
     result = simulation.run(begin + way, way / max(2, round(way * cells / STEP)), observe=see, progress=False)
     points, drawn = simulation.points, bar.drawn(grid, simulation.t)
     out.frame = points.corners, np.linalg.norm(points.x - start, axis=1) / (way * D), drawn
+    out.lines = tuple(x + start for x, start in zip(simulation.grid.lines, simulation.grid.base, strict=True))
     out.steps, out.cuts = out.steps + result.steps, out.cuts + result.cuts
     return kept(simulation)
 
@@ -195,6 +212,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--depth", type=float, default=1.0, help="of the pushes, over the diameter")
     parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in wet clay")
     parser.add_argument("--wet-depth", type=float, default=1.0, help="of the pushes into wet clay, over the diameter")
+    parser.add_argument("--follow", action="store_true", help="push the last bar once more, with lines that follow it")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
         parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 4], in [0, 1]")
@@ -211,6 +229,8 @@ def main(argv: list[str] | None = None) -> dict:
             out["cuts"], out["steps"] = out["cuts"] + run.cuts, out["steps"] + run.steps
             found = f"alpha = {alpha:g}: N = {last.mean():.3f}, {last.min():.3f} to {last.max():.3f}"
             print(f"{found}, exact {exact(alpha):.3f}; {run.cuts} of {run.steps} steps cut", flush=True)
+        if o.follow and runs:
+            out["follow"] = following(o, *list(runs.items())[-1])
         wet = {name: push_wet(rate, o.wet_cells, o.wet_depth) for name, rate in RATES.items()}
         for name, run in wet.items():
             out[name] = {"N": run.N[-1], "excess": run.excess[-1], "steps": run.steps, "cuts": run.cuts}
@@ -221,6 +241,29 @@ def main(argv: list[str] | None = None) -> dict:
         most = max(run.cuts / run.steps for run in wet.values())
         out["converged"] = max(most, out["cuts"] / max(1, out["steps"])) <= 0.1 and out["balance"] <= BALANCE
     return out
+
+
+def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
+    """Push a bar through lines that follow it; return its resistance and cells, over those in equal cells."""
+    run = push(alpha, o.cells, o.depth, follow=True)
+    N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
+    count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))
+    found = f"alpha = {alpha:g}, lines that follow: N = {N:.3f} in {count} cells, {beside:.3f} in {whole} equal cells"
+    print(f"{found}; {run.cuts} of {run.steps} steps cut", flush=True)
+    fig, grid = common.figure(1, 2, (12, 7))
+    axes = grid.ravel()
+    for each, name in ((equal, f"{whole} equal cells"), (run, f"{count} cells that follow")):
+        axes[0].plot(each.depth, each.N, label=name)
+    axes[0].axhline(exact(alpha), color="k", ls="--", lw=0.8)
+    axes[0].set(xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="dashed: exact", ylim=(0, None))
+    axes[0].legend(fontsize=9)
+    show(axes[1], run, "displacement / that of the bar (-)", f"lines that follow, α = {alpha:g}", (0, 1.5))
+    x, y = run.lines
+    axes[1].vlines(x, y[0], y[-1], color="k", lw=0.4)
+    axes[1].hlines(y, x[0], x[-1], color="k", lw=0.4)
+    axes[1].set(xlim=(0, HALF), ylim=(-HALF, HALF))
+    common.save(fig, o.out / "lines.png", dpi=80)
+    return {"load": float(N / beside - 1), "cells": float(count / whole)}
 
 
 def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:

@@ -240,6 +240,15 @@ def draining(grid):
     return mpm.Simulation(grid, [body], [soil], conditions=[mpm.Drained("bottom", -5e3)], **more)
 
 
+def sliding(grid):
+    """Return a block pushed along another one, with friction."""
+    lower, upper = mpm.box(grid, [0.1, 0], [1.1, 0.5]), mpm.box(grid, [0.4, 0.5], [0.7, 0.8])
+    load = mpm.Traction("top", lambda t: (300 * t, -1e3), region=([0, 0.7], [1.2, 1.2]))
+    acting = [load, mpm.Contact(1, 0, friction=0.5)]
+    soil = mpm.Hencky(1e6 / 3, 5e5)
+    return mpm.Simulation(grid, [lower, upper], [soil], walls={"bottom": "xy"}, conditions=acting)
+
+
 def of_points(grid):
     """Return a dry beam that is integrated at its points."""
     load = mpm.Traction("right", lambda t: (0, -100 * t))
@@ -251,11 +260,12 @@ def of_points(grid):
 
 
 SCENES = [(beam, 1.0), (layers, 1.0), (yielding, 1.0), (softening, 1.0), (vibrating, 0.1), (touched, 1.0)]
-SCENES += [(draining, 1e3), (of_points, 1.0)]
+SCENES += [(draining, 1e3), (of_points, 1.0), (sliding, 1.0)]
 
 
 @pytest.mark.parametrize(
-    "make, end", [pytest.param(*s, marks=[] if s[0] in (beam, touched) else [pytest.mark.slow]) for s in SCENES]
+    "make, end",
+    [pytest.param(*s, marks=[] if s[0] in (beam, touched, sliding) else [pytest.mark.slow]) for s in SCENES],
 )
 def test_lines_that_are_nearly_equal_show_what_equal_cells_do(make, end):
     """This compares all terms of the code for cells of many sizes with the code for equal cells."""
@@ -366,12 +376,20 @@ def test_what_lines_do_not_allow_is_refused_in_one_line(make, name, value):
     refused_in_one_line(make, name, value, None, 200)
 
 
-def test_contacts_of_groups_are_refused():
-    grid = uneven(2)
-    bodies = [mpm.box(grid, [0, 0], [1, 0.4]), mpm.box(grid, [0, 0.4], [1, 0.8])]
-    contact = mpm.Contact([0], [1], friction=0.3)
-    with pytest.raises(ValueError, match="contacts: must be none on a grid of unequal cells"):
-        mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, conditions=[contact])
+def test_bodies_in_contact_press_each_other_evenly_between_lines_at_random():
+    """Within the penetration that contact leaves, a thousandth of a cell."""
+    lines, low, high = at_random([0, 0], [1, 2], [8, 16], 5), 0.54625, 1.06
+    grid = mpm.Grid(lines=lines)
+    bodies = [mpm.box(grid, [0, 0], [1, low], per_cell=2), mpm.box(grid, [0, low], [1, high], per_cell=3)]
+    hold = mpm.Displacement("top", (0, -0.1), region=([0, 0.8], [1, 2]))
+    walls = {"bottom": "y", "left": "x", "right": "x"}
+    soil = mpm.Hencky(bulk=1e6 / 3, shear=5e5)
+    s = mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=[hold, mpm.Contact(0, 1)])
+    s.step(1.0)
+    stretch = 1 - 0.1 / high
+    exact = 1e6 * np.log(stretch) / stretch
+    assert s.tool_forces.array[0, 1] == pytest.approx(exact, rel=1e-3)
+    assert np.abs(s.effective_stress()[:, 1, 1] / exact - 1).max() < 2e-3
 
 
 @pytest.mark.slow

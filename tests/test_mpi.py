@@ -26,7 +26,9 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-NAMES = "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes"
+NAMES = (
+    "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes following"
+)
 NAMES = NAMES.split()
 SCENES = [(f"mpi_{name}.py", (3,)) for name in NAMES]
 SLOW = [

@@ -35,3 +35,15 @@ def test_clay_seeded_anew_resists_a_rough_bar_as_before(cells, depth, error):
     assert run.depth[-1] == pytest.approx(depth) and run.cuts <= 0.15 * run.steps
     assert ways[1:] == pytest.approx(ways[0], rel=0.02)
     assert ways == pytest.approx(demo.exact(1), rel=error)
+
+
+@pytest.mark.slow
+def test_lines_that_follow_the_bar_find_the_resistance_in_a_quarter_of_the_cells():
+    """Within a per cent of that in equal cells."""
+    found = []
+    for follow in (False, True):
+        run = demo.push(1.0, 8, 0.5, follow)
+        cells = np.prod([len(x) - 1 for x in run.lines])
+        found.append((np.array(run.N)[run.steady].mean(), cells))
+    (N, whole), (other, cells) = found
+    assert other == pytest.approx(N, rel=0.01) and cells <= whole / 4, found

@@ -63,6 +63,8 @@ def test_no_folder_has_more_than_fourteen_files():
 CHANGES = {
     ("Simulation", "state"): "the one state",
     ("Grid", "_cells"): "the mesh, made when first it is needed",
+    ("Grid", "_spacing"): "lines of a grid that follows, which are set from the state before anything reads them",
+    ("Cells", "at"): "where its nodes and cells are, between these lines",
     ("CompiledForm", "_last"): "what a form is bound to, until it is bound again",
     ("Active", "now"): "which cells hold something since the grid was reset",
     ("Latest", "_entry"): "the key and the value that were made last",

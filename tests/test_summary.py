@@ -120,6 +120,7 @@ BENCHMARK = {
     "files of each step": set(),
     "layers off the grid lines": set(),
     "grid reset in each step": {"reset of the grid"},
+    "grid lines that move": {"moving grid lines"},
     "16 times the background grid": set(),
     "256 times the background grid": set(),
 }

@@ -125,8 +125,6 @@ def grouped(
     for name, value in other.items():
         if value is not None and not (isinstance(value, Sequence) and not len(value)):
             raise ValueError(f"{name}: must be none with contacts")
-    if not grid.even:
-        raise ValueError("contacts: must be none on a grid of unequal cells")
     group = np.zeros(len(bodies), dtype=np.int64)
     for number, members in enumerate(groups_of(contacts, len(bodies))):
         group[list(members)] = number

@@ -155,7 +155,7 @@ class Contacts:
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
             if there is not points:
                 near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, reach())
-                slides = not near[pairs.gap < CLEAR * grid.h.min()].all()
+                slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(there)[pairs.row])].all()
                 off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
                 pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
             row = pairs.row
@@ -243,15 +243,15 @@ class Contacts:
         if not count:  # the bodies of the other group are absent
             none = np.zeros(0, dtype=np.int64)
             return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
-        reach = REACH * self.grid.h.min() + self.grid.h.max()
+        reach = REACH * (self.grid.least if self.grid.even else self.grid.most) + self.grid.most
         _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
         row, column = np.nonzero(near < len(facets.x))
         other = near[row, column]
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
-        met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * self.grid.h.min())
-        met &= gap >= -DEEP * self.grid.h.min()
+        h = self._sizes(x[row])
+        met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * h) & (gap >= -DEEP * h)
         row = row[met]
         other = other[met]
         t = t[met]
@@ -262,7 +262,7 @@ class Contacts:
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) just inside faces at places x (m, d), if they hold a part of the face, else its own."""
-        grid, inside = self.grid, x - NEAR * self.grid.h.min() * facets.outward[chosen]
+        grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
@@ -272,14 +272,19 @@ class Contacts:
 
         points: at the start of the step.
         """
-        out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.h.max()
+        out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
+        reach = np.broadcast_to(reach, corners.shape[:2])
         for pair in self._faces:
             for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, points).x
                 mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
-                distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=reach)
-                out[mine] |= distance < reach
+                distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=BESIDE * self.grid.most)
+                out[mine] |= distance < reach[mine]
         return out
+
+    def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Return the shortest edges (...), m, of the cells at positions (..., d), m; one number for equal cells."""
+        return self.grid.least if self.grid.even else self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise an error if groups overlap after a step, or may have passed through each other in it.
@@ -289,14 +294,14 @@ class Contacts:
         NotConverged
             With the place; a shorter step may succeed.
         """
-        h, comm = self.grid.h.min(), self.grid.comm
+        h, comm = self._sizes(before.corners), self.grid.comm
         moved = points.corners - before.corners
         low, high = (
             over_all(comm, ends(moved, axis=(0, 1), initial=start), op)
             for ends, start, op in ((np.min, np.inf, MPI.MIN), (np.max, -np.inf, MPI.MAX))
         )
-        sizes = [np.linalg.norm(moved - by, axis=2).max(initial=0.0) for by in (0.0, (low + high) / 2)]
-        if 2 * over_all(comm, np.array(sizes), MPI.MAX).min() > REACH * h:
+        cells = [(np.linalg.norm(moved - by, axis=2) / h).max(initial=0.0) for by in (0.0, (low + high) / 2)]
+        if 2 * over_all(comm, np.array(cells), MPI.MAX).min() > REACH:
             raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
         if message := self._too_deep(cut, points):
             raise NotConverged(message)
@@ -308,7 +313,7 @@ class Contacts:
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
         """Return a message with the depth and place of an overlap of groups, "" if there is none."""
-        h, comm = self.grid.h.min(), self.grid.comm
+        h, comm = self.grid.least, self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
             _, pairs = self._met(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
 from mpm_dolfinx.grid.grid import Grid, ranges, sum_by
-from mpm_dolfinx.points.cutting import FACES, corner_bits, cut, on_planes, simplex_volumes, sliced, vertices, volumes
+from mpm_dolfinx.points.cutting import (
+    FACES,
+    corner_bits,
+    cut,
+    on_planes,
+    simplex_volumes,
+    sliced,
+    slices_in_cells,
+    vertices,
+    volumes,
+)
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
@@ -78,10 +88,10 @@ class New(NamedTuple):
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
     """Return which domains (n, 4, 2) have an edge longer than `longest` cells, or an inverted part."""
-    ring = corners[:, RING] / grid.h
+    ring = corners[:, RING] / grid.h if grid.even else grid.in_cells(corners)[:, RING]
     edge = np.roll(ring, -1, axis=1) - ring
     parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
-    turned = parts.min(axis=0, initial=0.0) < -CRUMB * grid.cell_volume
+    turned = parts.min(axis=0, initial=0.0) < -CRUMB * grid.sizes_at(corners.mean(axis=1)).prod(axis=-1)
     return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | turned
 
 
@@ -118,13 +128,17 @@ class RefilledCells:
         self.parts = self._parts(faces)
         barred = self._barred(flowed, signs)
         self.passed, self.region = self._chains(barred)
-        size = self.pieces.fraction * np.abs(volumes(points.corners))[self.pieces.point] / grid.cell_volume
+        size = self.pieces.fraction * np.abs(volumes(points.corners))[self.pieces.point] / self._volume(self.cell)
         filled = np.where(self.passed, self.region.area_of(self.cells), 1.0)
         barred |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
         self.chosen = self._chosen(flowed & needs, barred, size < SMALL)
         """Cells to renew."""
         self.gone = self._at(self.chosen)
         """Which points (n,) lose their domains or parts of them."""
+
+    def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
+        """Return the volumes (n,), m^2, of cells (n,); one number for equal cells."""
+        return self.grid.sizes_of(cells).prod(axis=-1)
 
     def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which points (n,) have a piece in some cells."""
@@ -171,11 +185,12 @@ class RefilledCells:
         corners = self.points.corners[faces.point]
         n = np.arange(len(faces.face))
         ends = np.stack([corners[n, START[faces.face]], corners[n, END[faces.face]]])
-        y = on_planes(grid, grid.in_cells(ends), ends, 2)[0]
+        y = on_planes(grid, grid.in_cells(ends), ends, 2)[1]
         t = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, len(n), 1))
         s, row = np.concatenate([y, t], axis=2).transpose(0, 2, 1), n
         for axis in range(2):
             s, row = sliced(s, row, axis, grid)
+        s = slices_in_cells(grid, s)
         s = np.where((s[0, 2] <= s[1, 2])[None, None], s, s[::-1])
         way = s[1, :2] - s[0, :2]
         size = np.hypot(*way)
@@ -236,7 +251,7 @@ class RefilledCells:
     def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the positions (n, k, 2), m, of local coordinates y (n, k, 2) in cells (n,), from 0 to 1."""
         index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
-        return self.grid.low + self.grid.h * (index[:, None] + y)
+        return self.grid.places(np.broadcast_to(index[:, None], y.shape), y)
 
     def full(self) -> New:
         """Return the new domains of full cells."""
@@ -359,15 +374,15 @@ class RefilledCells:
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.gone[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
-        left = left[area > CRUMB * self.grid.cell_volume]
-        rings, of = _convex(points.corners[pieces.point[left]], self.grid.h)
+        left = left[area > CRUMB * self._volume(self.cell[left])]
+        rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
-        near = NEAR * self.grid.h.min()  # tolerance: rounding would otherwise split a surface on a grid line
+        near = NEAR * self.grid.least  # tolerance: rounding would otherwise split a surface on a grid line
         polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
-        sound = Polygons.rings(quads).area > CRUMB * self.grid.cell_volume
+        sound = Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece])
         piece, quads = piece[sound], quads[sound]
         edge = edge[sound]
         left, number = np.unique(piece, return_inverse=True)
@@ -402,14 +417,14 @@ class RefilledCells:
 
         They are a least-squares fit to the pieces in the cell.
         """
-        pieces, h = self.pieces, self.grid.h
+        pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
 
         def means(columns: NDArray) -> NDArray:
             return np.stack([sum_by(self.cell, weight * c, self.cells) / whole for c in columns.T], axis=1)
 
-        y, q = self.points.x[pieces.point] / h, values[pieces.point]
+        y, q = self.points.x[pieces.point] / grid.sizes_of(self.cell), values[pieces.point]
         y = y - means(y)[self.cell]
         q = q - means(q)[self.cell]
         normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
@@ -417,7 +432,7 @@ class RefilledCells:
         value, axes = np.linalg.eigh(normal)
         some = value > SAME  # cells squared: pieces in a row determine no slope across the row
         back = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
-        slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / h[:, None]
+        slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / grid.sizes_of(np.arange(self.cells))[..., None]
         return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.left]])[group]]
 
     @cached_property
@@ -440,7 +455,7 @@ class RefilledCells:
         at = order[at]
         old = self.pieces.point[piece[of]]
         common = np.zeros(len(of))
-        rings, which = _convex(self.points.corners[old], self.grid.h)
+        rings, which = _convex(self.points.corners[old], self._volume(self.cell[piece[of]]))
         common += np.maximum(sum_by(which, rings.within(corners[at][which][:, RING]).area, len(of)), 0.0)
         common += EPSILON * np.abs(volumes(corners[at]))  # a domain without an overlap gets the mean of its cell
         total = sum_by(of, common, len(piece))
@@ -458,7 +473,7 @@ class RefilledCells:
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
-        length = np.linalg.norm((parts.x[inside, 1] - parts.x[inside, 0]) * self.grid.h, axis=1)
+        length = np.linalg.norm((parts.x[inside, 1] - parts.x[inside, 0]) * self.grid.sizes_of(cell), axis=1)
         flat = values[of].reshape(len(of), int(np.prod(values.shape[1:])))
         count = int(self.chosen.sum())
         number = self._group(cell)
@@ -474,17 +489,17 @@ def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[n
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 
-def _convex(corners: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[Polygons, NDArray[np.int64]]:
+def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
     """Return domains (n, 4, 2) as convex polygons with face numbers of their edges, and the domain of each polygon.
 
-    h (2,): edges of a cell, m.
+    volume (n,): of their cells, m^2.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))
     away = np.roll(ring, -1, axis=1) - ring
     before = np.roll(away, 1, axis=1)
     turn = before[:, :, 0] * away[:, :, 1] - before[:, :, 1] * away[:, :, 0]
-    bent = turn.min(axis=1) < -NEAR * h.prod()  # tolerance: rounding would otherwise choose a diagonal
+    bent = turn.min(axis=1) < -NEAR * volume  # tolerance: rounding would otherwise choose a diagonal
     even = np.flatnonzero(~bent)
     out, of = [(ring[even], edge[even])], [even]
     at = np.flatnonzero(bent)

@@ -503,8 +503,7 @@ class PointExpression:
         self._bound = {size: self._compiled.bind(np.arange(size)) for size in sorted(sizes)}
         self._rows.room(max(sizes))
         self._values = np.empty((max(sizes), int(np.prod(self._shape, dtype=int))))
-        volumes = points.grid.volumes(np.arange(max(sizes)))
-        self._volume = volumes if points.grid.even else volumes[:, None]
+        self._grid = points.grid
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the present values of the fields that change while the points stay."""
@@ -517,13 +516,14 @@ class PointExpression:
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)
         out, start = np.empty((count, self._values.shape[1])), 0
+        of_cells = self._grid.volumes(np.arange(len(self._values)))[..., None] if not self._grid.even else None
         while start < count:
             size = max((size for size in self._bound if size <= count - start), default=min(self._bound))
             stop, values = min(start + size, count), self._values[:size]
             self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
             values[:] = 0.0
             self._compiled.assemble_vector(values.reshape(-1), self._rows.room(size)[:size], self._bound[size])
-            of_cell = self._volume if np.isscalar(self._volume) else self._volume[: stop - start]
+            of_cell = self._grid.cell_volume if of_cells is None else of_cells[: stop - start]
             np.divide(values[: stop - start], of_cell, out=out[start:stop])
             start = stop
         return out.reshape(count, *self._shape)

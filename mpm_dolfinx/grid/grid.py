@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache, cached_property, partial, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
+from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import checked, equal, rounding
 from mpm_dolfinx.grid.partition import destinations, owners
 
@@ -87,14 +88,32 @@ def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
     return first, other, (first + other) / 2
 
 
+class CellPlaces(NamedTuple):
+    """Nodes (nodes, d) and midpoints (cells, d) from the grid's base, m; edges (cells, d), m, None for equal cells."""
+
+    node_x: NDArray[np.float64]
+    midpoints: NDArray[np.float64]
+    sizes: NDArray[np.float64] | None
+
+
+class Spacing(NamedTuple):
+    """The lines of a grid, and what depends on them; see the attributes of `Grid`."""
+
+    lines: tuple[NDArray[np.float64], ...]
+    widths: tuple[NDArray[np.float64], ...]
+    finest: NDArray[np.float64]
+    least: float
+    most: float
+    snap: NDArray[np.float64]
+
+
 class Cells:
     """The cells of a grid on this process, ghosts included, in the numbering of the mesh.
 
     num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): nodes in the numbering of Q1
-    degrees of freedom; node_x (nodes, d), midpoints (cells, d): positions relative to the grid's base, m; signs (2^d,
-    d): direction from the midpoint to each node; cell_number (cells,): lexicographic numbers; locals: the inverse of
-    it, -1 for cells of other processes; owners: rank of each cell, copy by copy; cell_facets (cells, 2d); facet_cells
-    (facets, 2): -1 on the boundary; sizes (cells, d): edges, m, None for equal cells.
+    degrees of freedom; at: present positions; signs (2^d, d): direction from the midpoint to each node; cell_number
+    (cells,): lexicographic numbers; locals: the inverse of it, -1 for cells of other processes; owners: rank of each
+    cell, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 on the boundary.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -104,17 +123,18 @@ class Cells:
         nodes = _compat.function_space(mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(mesh)
         self.cell_nodes = _compat.cell_dofs(nodes)
-        self.node_x = nodes.tabulate_dof_coordinates()[:, :d]
-        corners = self.node_x[self.cell_nodes]
-        self.midpoints = corners.mean(axis=1)
+        node_x = nodes.tabulate_dof_coordinates()[:, :d]
+        corners = node_x[self.cell_nodes]
+        midpoints = corners.mean(axis=1)
         # all cells list their vertices in the same order (tested), so all processes compile the same forms, even a
         # process without a cell
-        self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
-        self.cell_number = grid.number(grid.index_from_base(self.midpoints))
+        self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - midpoints[:1, None])))[0]
+        self.cell_number = grid.number(grid.index_from_base(midpoints))
         if grid.copies > 1:
             brought = np.concatenate(grid.comm.allgather((owners == grid.comm.rank).nonzero()[0]))
             self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
-        self.sizes = None if grid.even else grid.sizes_of(self.cell_number)
+        self.at = CellPlaces(node_x, midpoints, None if grid.even else grid.sizes_of(self.cell_number))
+        self._index = [grid.nodes_along(x[:, :d]) for x in (node_x, mesh.geometry.x)] if grid.follow is not None else []
         self.locals = np.full(len(owners), -1, dtype=np.int32)
         self.locals[self.cell_number] = np.arange(self.num_local)
         topology = mesh.topology
@@ -132,11 +152,39 @@ class Cells:
         self.cellwise = cache(partial(_compat.function_space, mesh, "DG", 0))
         """Function spaces by value shape, each made once, and one function of each shape with shared memory."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
+        self.move(grid)
+
+    @cached_property
+    def edges(self) -> fem.Function:
+        """Edges of the cells, m, for forms on cells of several sizes."""
+        out = fem.Function(self.cellwise((self.at.sizes.shape[1],)))
+        out.x.array[:] = self.at.sizes.ravel()
+        return out
+
+    def move(self, grid: Grid) -> None:
+        """Move mesh, nodes and cells to the lines of a grid that follows; positions depend on nothing else."""
+        if grid.follow is None:
+            return
+        node_x, x = map(grid.places, self._index)
+        self.mesh.geometry.x[:, : grid.dim] = x
+        self.at = CellPlaces(node_x, node_x[self.cell_nodes].mean(axis=1), grid.sizes_of(self.cell_number))
+        if "edges" in vars(self):
+            self.edges.x.array[:] = self.at.sizes.ravel()
 
 
 def of_cells(name: str) -> cached_property:
     """Return a property of a grid that is an attribute of its `Cells`, which are made once."""
     return cached_property(lambda grid: getattr(grid._of_process, name))
+
+
+def of_places(name: str) -> property:
+    """Return a property of a grid that reads present positions of its `Cells`."""
+    return property(lambda grid: getattr(grid._of_process.at, name))
+
+
+def of_spacing(name: str) -> property:
+    """Return a property of a grid that depends on its present lines, see `Spacing`."""
+    return property(lambda grid: getattr(grid._spacing, name))
 
 
 class Grid:
@@ -156,6 +204,10 @@ class Grid:
     lines : (n,) along each axis, m
         Ascending coordinates of all grid lines, instead of `lower`, `upper` and `cells`; see `graded`.  Lines of equal
         spacing along all axes give the grid of equal cells.
+    follow : Tool, or callable -> (n,) along each axis, m
+        What the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move as the tool
+        does, and the cells around them widen and narrow.  A function of the time t (s) and positions x (n, d) of all
+        points, by these names, returns as many lines, between the same sides.
     axisymmetric
         The first axis is the radius r >= 0, the second the axis of revolution.  The scene has no torsion.  Volumes,
         forces and outflows belong to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side
@@ -165,15 +217,17 @@ class Grid:
     ------
     ValueError
         Corners or lines that are not finite or not ascending, numbers of cells that are not integers >= 1, more nodes
-        than PETSc can number, or an axisymmetric grid in 3D or with r < 0.
+        than PETSc can number, an axisymmetric grid in 3D or with r < 0, or `follow` without lines.
 
     Attributes
     ----------
     dim, shape, lower, upper
         d; number of cells along each axis (d,); corners (d,), m.
     even, lines, widths
-        Whether all cells are equal; lines (n,), m, along each axis, relative to `base`; edges (n - 1,), m, along each
-        axis if the cells differ.
+        Whether all cells are equal; present lines (n,), m, along each axis, relative to `base`; edges (n - 1,), m,
+        along each axis.
+    finest, least, most
+        Shortest edges (d,), m, along each axis; shortest and longest edge of a cell, m.
     snap
         Distance (d,) to a grid plane along each axis, in cells, below which a vertex lies on the plane.
     base, low, high
@@ -195,14 +249,17 @@ class Grid:
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         *,
         lines: Sequence[ArrayLike] | None = None,
+        follow: Any = None,
         axisymmetric: bool = False,
     ):
-        self.even = lines is None
+        self.even, self.follow = lines is None, follow
+        if follow is not None:
+            check_follow(follow, lines)
         if not self.even:
             if any(value is not None for value in (lower, upper, cells)):
                 raise ValueError("grid: lines are given, lower, upper and cells must not be")
             lines = checked(lines)
-            self.even = all(map(equal, lines))
+            self.even = all(map(equal, lines)) and follow is None
             lower, upper, cells = ([of(x) for x in lines] for of in (np.min, np.max, lambda x: len(x) - 1))
         self.lower = numbers("grid: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
         self.dim = d = self.lower.size
@@ -226,21 +283,39 @@ class Grid:
         self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
         self.low, self.high = self.lower - self.base, self.upper - self.base
         self._h = (self.upper - self.lower) / self.shape if self.even else None
-        if not self.even:
-            self.lines = tuple(x - start for x, start in zip(lines, self.base, strict=True))
-            self.widths = tuple(map(np.diff, self.lines))
-        self.finest = self._h if self.even else np.array([w.min() for w in self.widths])
-        """Shortest edges (d,), m, along each axis."""
-        self.least, self.most = float(self.finest.min()), float(max(map(np.max, self._h if self.even else self.widths)))
-        """Shortest and longest edge of a cell, m."""
-        self.snap = np.maximum(SNAP, [rounding(e) for e in zip(self.lower, self.upper, strict=True)] / self.finest)
+        self.seeded: tuple[NDArray[np.float64], ...] | None = None if self.even else self.from_base(lines)
+        """Lines (n,), m, along each axis as given, relative to the base, on which bodies are seeded."""
+        self._spacing = self._spaced(self.seeded)
         self.comm = comm
         self._cells: Cells | None = None
 
-    @cached_property
-    def lines(self) -> tuple[NDArray[np.float64], ...]:
-        """Lines (n,), m, along each axis, relative to the base."""
-        return tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self.h, strict=True))
+    def from_base(self, lines: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
+        """Return true lines (n,), m, along each axis, relative to the base."""
+        return tuple(x - start for x, start in zip(lines, self.base, strict=True))
+
+    def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
+        """Return lines relative to the base, None for equal cells, and what depends on them."""
+        finest, most = self._h, self._h
+        if lines is None:
+            lines = tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self._h, strict=True))
+        widths = tuple(map(np.diff, lines))
+        if not self.even:
+            finest, most = (np.array([of(w) for w in widths]) for of in (np.min, np.max))
+        snap = np.maximum(SNAP, [rounding(e) for e in zip(self.lower, self.upper, strict=True)] / finest)
+        return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
+
+    def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
+        """Move the lines of a grid that follows to these (n,), m, along each axis, relative to the base.
+
+        All positions then are those of a grid made with these lines, whatever the lines were before.
+        """
+        if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
+            self._spacing = self._spaced(tuple(lines))
+            if self._cells is not None:
+                self._cells.move(self)
+
+    lines, widths, finest = map(of_spacing, ("lines", "widths", "finest"))
+    least, most, snap = map(of_spacing, ("least", "most", "snap"))
 
     @property
     def h(self) -> NDArray[np.float64]:
@@ -256,11 +331,11 @@ class Grid:
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of local cells; one row (d,) for equal cells."""
-        return self._h if self.even else self._of_process.sizes[cells]
+        return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
         """Return the edges (n,), m, of local cells (n,) along one axis, or along an axis for each (n,)."""
-        return self.h[axis] if self.even else self._of_process.sizes[cells, axis]
+        return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
         """Return the distances (n,), m, between midpoints of local cells (n,) and their neighbours along an axis."""
@@ -268,7 +343,7 @@ class Grid:
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
         """Return the volumes (n,), m^d, of local cells, in axisymmetry in the plane; one number for equal cells."""
-        return self.cell_volume if self.even else self._of_process.sizes[cells].prod(axis=-1)
+        return self.cell_volume if self.even else self._of_process.at.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
         """Return volume over longest edge of local cells (n,), m^(d-1); one number for equal cells."""
@@ -318,11 +393,7 @@ class Grid:
 
     def edge_in_forms(self) -> Any:
         """Return the edges (d,), m, of the cell as UFL; a constant for equal cells."""
-        if self.even:
-            return fem.Constant(self.mesh, self._h)
-        out = fem.Function(self.cellwise((self.dim,)))
-        out.x.array[:] = self._of_process.sizes.ravel()
-        return out
+        return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the indices (..., d) along the axes of nodes at positions (..., d), m, from the base."""
@@ -347,8 +418,7 @@ class Grid:
     num_owned = of_cells("num_owned")
     num_local = of_cells("num_local")
     cell_nodes = of_cells("cell_nodes")
-    node_x = of_cells("node_x")
-    midpoints = of_cells("midpoints")
+    node_x, midpoints = map(of_places, ("node_x", "midpoints"))
     signs = of_cells("signs")
     cell_number = of_cells("cell_number")
     locals = of_cells("locals")
@@ -442,7 +512,7 @@ class Grid:
         """Arguments that make an equal grid: corners and numbers of cells, or lines."""
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape}
-        return {"lines": [x + start for x, start in zip(self.lines, self.base, strict=True)]}
+        return {"lines": [x + start for x, start in zip(self.seeded, self.base, strict=True)], "follow": self.follow}
 
     @property
     def reach(self) -> float:
@@ -594,7 +664,7 @@ class GridOfGroups(Grid):
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):
-        super().__init__(grid.lower, grid.upper, grid.shape, grid.comm)
+        super().__init__(**grid.given, comm=grid.comm)
         self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"

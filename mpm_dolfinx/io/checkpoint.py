@@ -142,6 +142,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     bare = at_root(comm, read)
     state = found[0] if found else bare
     nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
+    if state.lines is not None:
+        simulation.grid.move([state.lines[letter] for letter in sorted(state.lines)])
     simulation.state = replace(state, stage=simulation.state.stage, **nodal).at_owners(simulation.grid)
     log(comm, "t = %g s: resumed from %s after %d steps", state.t, file, state.result.steps)
     return simulation.result
@@ -162,6 +164,8 @@ def _arrays(state: State) -> dict[str, NDArray]:
                 rows.append(one)
     if state.pieces is not None:
         named["pieces"] = state.pieces.arrays
+    if state.lines is not None:
+        named["lines"] = state.lines
     if state.stay is not None:
         named["stay"] = {"points": vars(state.stay.points)}
         if state.stay.keeps is not None:
@@ -191,6 +195,9 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
                 raise ValueError("pieces: of_cell, start: do not fit the kept cut")
+        lines = _part(arrays, "lines/") or None
+        if lines is not None:
+            _check_lines(lines, simulation.grid)
         histories = _part(arrays, "result/")
         times = histories["t"]
         outcomes = _outcomes(_part(histories, "outcome/"), len(times))
@@ -208,6 +215,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             pieces=pieces,
             stay=stay,
             resets=note["resets"],
+            lines=lines,
             outcome=_like(outcome, now.outcome),
             stage=None,
             begins=note["begins"],
@@ -309,6 +317,17 @@ def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.floa
     at = np.searchsorted(node, here)
     found = np.append(node, -1)[at] == here
     return values[np.where(found, at, len(node))].ravel()
+
+
+def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
+    """Raise ValueError for arrays that are not lines of the grid, which follows."""
+    shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
+    if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
+        raise ValueError("lines: not those of the grid")
+    for letter, low, high in zip(shapes, grid.low, grid.high, strict=True):
+        x = arrays[letter]
+        if x.dtype != np.float64 or not (np.diff(x) > 0).all() or x[0] != low or x[-1] != high:
+            raise ValueError("lines: not ascending between the sides of the grid")
 
 
 def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:

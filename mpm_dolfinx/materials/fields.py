@@ -90,7 +90,7 @@ class SceneMaterials:
             whole = dict(zip(self._used, known, strict=True))
             materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
             evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
-        self.materials = materials
+        self.materials, self._evaluated = materials, evaluated
         used = [materials[i] for i in self._used]
         self._fields = [_by_place(m) for m in materials]
         self.laws = list(dict.fromkeys(map(type, used)))
@@ -125,6 +125,7 @@ class SceneMaterials:
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
+        self.check_cells()
         self.shapes: dict[str, tuple[int, ...]] = {}
         """Shape of each parameter and variable of state."""
         for i, m in zip(self._used, evaluated, strict=True):
@@ -157,6 +158,11 @@ class SceneMaterials:
             for law in self.laws
         ]
 
+    def check_cells(self) -> None:
+        """Raise ValueError if cells are too large for a softening law, when they are made or have moved."""
+        for m in self._evaluated:
+            m.check_cells(mean_size(self.grid))
+
     @property
     def across(self) -> bool:
         """Whether laws take a stretch out of plane in plane strain, from the mean dilatation."""
@@ -181,7 +187,6 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
-        m.check_cells(mean_size(self.grid))
         if "suction" in law.state and self.fluid is not None and m.retention is None:
             raise ValueError(f"{law.__name__}: retention = None, must be a retention curve for a law with suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:

@@ -237,8 +237,8 @@ def on_planes(
     return y, np.where(near, planes, x)
 
 
-def _in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return slices (d, d, m), each in one cell, with positions for slicing turned into cells from the lower corner."""
+def slices_in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return slices (d, k, m), each in one cell, with positions for slicing turned into cells from the lower corner."""
     if grid.even:
         return s
     out = s.copy()
@@ -273,7 +273,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     facet = np.arange(s.shape[2])
     for axis in range(d):
         s, facet = sliced(s, facet, axis, grid)
-    s = _in_cells(grid, s)
+    s = slices_in_cells(grid, s)
     area = _area_vectors(s)
     area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has changed the order of vertices
     return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second)
@@ -589,7 +589,7 @@ def _polygons(
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
-    cell = np.floor(_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)
+    cell = np.floor(slices_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)
     cell -= cell.min(axis=1, initial=0, keepdims=True)
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)

@@ -51,9 +51,10 @@ class CellFields:
 
 def cell_fields(scene: Scene, state: State) -> CellFields:
     """Return the cell fields of a state; all processes call it together."""
+    scene.rests_at(state.stage, state.t)
+    state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
     points = state.points
-    scene.rests_at(state.stage, state.t)
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
     cut, places = on_grid.cut, on_grid.data.pieces.places
     weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])

@@ -33,6 +33,7 @@ REACH = int(RADIUS)
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
     """Return the pore pressures (m,), Pa, at probes; all processes call it together."""
+    state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
     gravity = state.stage.gravity_at(state.t)

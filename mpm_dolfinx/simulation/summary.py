@@ -42,6 +42,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
     laws, evolves = ", ".join(law.__name__ for law in s.materials.laws), ", ".join(s.materials.state_names)
     return [
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
+        _either("moving grid lines", s.grid.follow is not None, "at each reset", "lines stay"),
         _either("axisymmetry", s.grid.axisymmetric, "rings about r = 0", "plane strain" if s.grid.dim == 2 else "3D"),
         Part(
             "stress",

@@ -164,7 +164,8 @@ def run(
     now = simulation.state.t
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
-    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
+    state = simulation.scene.followed(simulation.state)  # the first step depends on the cells
+    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, state.points)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
     events = Events(simulation, until)

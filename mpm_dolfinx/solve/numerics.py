@@ -31,7 +31,7 @@ class Numerics:
         Time integration: "sdirk2", of second order, or "backward-euler".
     renewal
         Whether to renew particle domains of yielded soil that have become longer than a cell, see
-        `stepping/renewal.py`. It needs dry or saturated soil in plane strain, equal cells, no inertia, no groups, and
+        `stepping/renewal.py`. It needs dry or saturated soil in plane strain, no inertia, no groups, and
         `quadrature="domain"`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.

@@ -651,6 +651,6 @@ def assembled(
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
         pairs = on_grid.key if any(one.couples for one in loads) else None  # contact pairs depend on the positions
-        pairs = pairs, on_grid.not_full if stage.inertia else None
-        system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
+        others = pairs, on_grid.not_full if stage.inertia else None, () if grid.follow is None else grid.lines
+        system = systems((stage, on_grid.cells, dofs, on_grid.penalised, *others), make, grid.comm)
         return Assembled(momentum, storage, system, on_grid, stage, loads)

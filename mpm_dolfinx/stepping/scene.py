@@ -40,6 +40,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.moving_lines import with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
@@ -225,7 +226,16 @@ class Scene:
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
 
-        return self._on_grid(points.arrays, make, grid.comm)
+        lines = () if grid.follow is None else grid.lines
+        return self._on_grid((points.arrays, lines), make, grid.comm)
+
+    def followed(self, state: State) -> State:
+        """Return the state for its next step, with the lines of that step, on which the grid is put."""
+        if self.grid.follow is None:
+            return state
+        state = with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
+        self.materials.check_cells()
+        return state
 
     @cached_property
     def _renewal(self) -> Renewal | None:
@@ -236,7 +246,6 @@ class Scene:
         has = {
             "is in 3D": grid.dim == 3,
             "is axisymmetric": grid.axisymmetric,
-            "has cells of many sizes": not grid.even,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
             "has inertia": self.momentum.inertia is not None,
@@ -245,14 +254,16 @@ class Scene:
         }
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
-            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain on equal cells")
+            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain")
         return Renewal(grid, self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
 
-        renew: whether renewal is allowed.
+        renew: whether renewal is allowed. A state whose points all stay is returned as it is.
         """
+        if state.stays:
+            return state, 0
         if self._renewal is None or not renew:
             return state.at_owners(self.grid), 0
 
@@ -298,7 +309,7 @@ class Scene:
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         if not grid.even:
-            out |= {f"grid lines along {letter}": x.tolist() for letter, x in zip("xyz", grid.lines, strict=False)}
+            out |= {f"grid lines along {letter}": x.tolist() for letter, x in zip("xyz", grid.seeded, strict=False)}
         out |= {"quadrature": self.numerics.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
         if grid.copies > 1:
             first = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])

@@ -100,6 +100,7 @@ def begin_stage(
         raise ValueError(f"{next(iter(new_quiet))}: bodies had inertia before, must be quiet from its first stage on")
     state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
+    state = scene.followed(state)
     if state.stays:  # points have the pressures of their cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)

@@ -72,6 +72,9 @@ class State:
         The kept cut; None if the next step resets the whole grid.
     resets
         Number of resets of the grid.
+    lines
+        Lines (n,), m, by axis "x", "y", "z", of the last reset of a grid that follows, relative to its `base`; None
+        before, and for other grids.
     outcome
         Outcomes of the conditions at the end of the last step, by quantity and name; nan for new conditions before the
         first step of a stage. reactions (d,), N, of prescribed displacements; wall_reactions (d,), N, of the grid's
@@ -102,6 +105,7 @@ class State:
     pieces: PiecePressures | None
     stay: Stay | None = None
     resets: int = 0
+    lines: Mapping[str, NDArray[np.float64]] | None = None
     outcome: Outcome
     stage: Stage
     begins: bool = True

@@ -27,7 +27,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
     if dt > 0:
         scene.look_at([start, *gravity])
-    state, renewed = (state, 0) if state.stays else scene.for_reset(state, dt > 0)
+    state, renewed = scene.for_reset(scene.followed(state), dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # cut together

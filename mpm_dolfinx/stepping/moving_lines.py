@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""Grid lines that follow: chosen at each reset of the grid from the state alone, so a resumed run chooses the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.validation import takes
+from mpm_dolfinx.domains.cut_domains import STAYS
+from mpm_dolfinx.grid.following import carried, lines_at
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.stepping.state import State
+
+
+def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
+    """Return the state for its next step, with the lines of that step, on which the grid is put.
+
+    A kept cut ends when any line moves by more than `STAYS` cells, the motion of corners that ends it as well.
+
+    Parameters
+    ----------
+    left
+        Returns a state whose points all stay, without its kept cut; called with the grid on the state's lines.
+    """
+    before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
+    grid.move(before)
+    lines = _wanted(grid, state, before)
+    if state.stay is not None:
+        moved = [
+            np.abs(new - old)[1:-1] / np.minimum(np.diff(old)[1:], np.diff(old)[:-1])
+            for new, old in zip(lines, before, strict=True)
+        ]
+        if max(far.max(initial=0.0) for far in moved) <= STAYS:
+            lines = before
+        else:
+            state = left(state) if state.stays else state
+            pieces = state.pieces and replace(state.pieces, of_cell=None, start=None)
+            state = replace(state, stay=None, held=None, rest=None, pieces=pieces)
+    grid.move(lines)
+    return replace(state, lines=dict(zip("xyz", lines, strict=False)))
+
+
+def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
+    """Return the lines (n,), m, along each axis that belong to a state, relative to the base."""
+    if hasattr(grid.follow, "pose"):
+        for name, one in state.stage.given.items():
+            if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
+                way = one.pose(state.t, grid.dim, state.outcome["tool_travel"][name]).shift
+                return carried(grid.seeded, way)
+        return before
+    x = _of_all(grid, state) if "x" in takes(grid.follow) else None
+    lines = grid.from_base(
+        lines_at(grid.follow, [x + start for x, start in zip(grid.seeded, grid.base, strict=True)], state.t, x)
+    )
+    ends = [over_all(grid.comm, np.concatenate(lines), op) for op in (MPI.MIN, MPI.MAX)]
+    if (ends[0] != ends[1]).any():
+        raise ValueError(f"grid: follow at t = {state.t:g} s: lines differ between processes, must be equal on all")
+    return lines
+
+
+def _of_all(grid: Grid, state: State) -> NDArray[np.float64]:
+    """Return the true positions (n, d), m, of the points of all processes, by number."""
+    found = grid.comm.allgather((state.points.id, state.points.x))
+    ids, x = (np.concatenate(values) for values in zip(*found, strict=True))
+    return x[np.argsort(ids)] + grid.base

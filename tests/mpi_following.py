@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: MIT
+"""Push a disc into wet soil through lines that follow it, on any number of processes; write the state."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.Hencky(2e5, 1e5, porosity=0.4, conductivity=1e-4)
+
+
+def pushed(load=None):
+    """Return a wet block under a disc that follows a path, or sinks under a load, and lines that follow the disc."""
+    lines = mpm.graded([0, 0], [2, 2], [[[0.5, 0.8], [1.1, 1.4]]], 0.1, 1.2)
+    path = {"displacement": lambda t: (0.3 * t, -0.2 * t)} if load is None else {"load": load, "direction": (0.3, -1)}
+    disc = mpm.Tool(mpm.Ball((0.8, 1.1), 0.1), friction=0.2, **path)
+    grid = mpm.Grid(lines=lines, follow=disc)
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    acting = {"conditions": [disc, mpm.Drained("top")], "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, **acting)
+
+
+if __name__ == "__main__":
+    simulation = pushed()
+    result = simulation.run(0.1, 0.025, progress=False)
+    points = simulation.points
+    columns = (points.id, points.x, points.pressure, simulation.effective_stress(), points.F)
+    parts = simulation.grid.comm.gather(columns)
+    if parts:
+        ids, *rows = (np.concatenate(a) for a in zip(*parts, strict=True))
+        order = np.argsort(ids)
+        state = {name: values[order] for name, values in zip(("x", "p", "stress", "F"), rows, strict=True)}
+        state["lines"] = np.concatenate(simulation.grid.lines)
+        np.savez(sys.argv[1], **state, balance=result.balance, counts=[len(part[0]) for part in parts])

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: MIT
+"""Grid lines that follow a tool or a function: each step is as exact as on lines that stay."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from helpers import SOFT, refused_in_one_line
+from mpi_following import pushed
+from test_many_sizes import EXACT, KINDS, at_random
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.domains.cut_domains import STAYS
+from mpm_dolfinx.grid.following import carried
+from mpm_dolfinx.grid.grid import SIDES
+
+
+def jumping(dim, axisymmetric=False, every=1.0, high=1.3, last=3):
+    """Return a grid whose lines are other random ones every so many seconds, and stay from the last time on."""
+    cells = (8, 7) if dim == 2 else (5, 4, 5)
+    lines = partial(at_random, [0] * dim, [high] * dim, cells)
+    return mpm.Grid(lines=lines(0), follow=lambda t: lines(min(round(t / every), last)), axisymmetric=axisymmetric)
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_even_stresses_are_exact_while_lines_jump_at_random(dim, axisymmetric):
+    grid = jumping(dim, axisymmetric)
+    body = mpm.box(grid, [0] * dim, [1.03, 1.01, 0.97][:dim])
+    push = -4e5 if axisymmetric else -3e5
+    walls = {"left": "x", "bottom": "y"} if dim == 2 else {"left": "x", "front": "y", "bottom": "z"}
+    loads = [mpm.Pressure(side, lambda t: push * t / 4) for side in ["right", "top", "back"][:dim]]
+    soil = mpm.NeoHookean(bulk=2e6, shear=1e6)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=loads, numerics=EXACT)
+    s.run(4.0, 1.0, progress=False)
+    stress = s.effective_stress()
+    assert s.state.resets == 4 and np.abs(grid.lines[1] - grid.seeded[1]).max() > 0.02
+    assert np.abs(stress - stress.mean(axis=0)).max() < 1e-10 * np.abs(stress).max()
+    assert np.abs(s.points.F - s.points.F.mean(axis=0)).max() < 1e-10
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_linear_pressures_are_exact_while_lines_jump_at_random(dim, axisymmetric):
+    """In steady flow through a block that ends within cells, with gravity."""
+    grid, g = jumping(dim, axisymmetric, 1e3), np.array([0.0] * (dim - 1) + [-9.81])
+    slope = np.array([0.0 if axisymmetric else 3e3, -2e3, 1e3])[:dim]
+    rock = mpm.Hencky(bulk=1e15, shear=1e15, porosity=0.4, conductivity=1e-4)
+    names = ["bottom", "top"] if axisymmetric else list(SIDES[dim])
+    drained = [mpm.Drained(name, lambda x: 1e4 + x @ slope) for name in names]
+    hold = dict.fromkeys(("left", "bottom", "front")[: dim if dim == 3 else 2], "xyz"[:dim])
+    options = {"walls": hold, "fluid": mpm.Fluid(bulk=np.inf), "gravity": g, "conditions": drained, "numerics": EXACT}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0] * dim, [1.03] * dim)], [rock], **options)
+    result = s.run(4e3, 1e3, progress=False)
+    cells = s.cells()  # of the last step: its lines stay
+    assert s.state.resets == 4 and result.balance < 1e-8
+    assert np.abs(cells.pressure - 1e4 - cells.x @ slope).max() < 1e-10 * 2e4
+
+
+def test_sealed_soil_keeps_its_water_and_its_stress_while_lines_jump():
+    """Each cell's water changes, their sum does not, though pressures differ from point to point."""
+    grid = jumping(2)
+    soil = mpm.Hencky(1e6, 4e5, porosity=0.4)
+    walls = dict.fromkeys(SIDES[2], "xy")
+    acting = {"pressure": lambda x: 1e4 * np.sin(3 * x[:, 0]) * x[:, 1], "fluid": mpm.Fluid(bulk=1e6), "walls": walls}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1.3, 1.3])], [soil], **acting)
+    held = []
+    for _ in range(4):
+        s.step(1.0)
+        cells = s.cells()
+        held.append(np.bincount(cells.cell, cells.water, grid.cells))
+    assert np.ptp([h.sum() for h in held]) < 1e-12 * held[0].sum()
+    assert np.abs(held[1] - held[0]).max() > 0.1 * held[0].mean()
+
+
+def test_smallest_cells_move_with_the_tool_and_the_others_grow_from_them():
+    given = [np.array(x) for x in mpm.graded([0, -4], [4, 4], [[[0, -1], [1, 1]]], 0.125, 1.3)]
+    lines = carried(given, np.array([0.0, -0.9]))
+    assert (lines[0] == given[0]).all() and len(lines[1]) == len(given[1])
+    assert lines[1][[0, -1]].tolist() == [-4, 4]
+    width, before = np.diff(lines[1]), np.diff(given[1])
+    fine = before < 0.126
+    assert width[fine] == pytest.approx(0.125) and given[1][:-1][fine][0] - lines[1][:-1][fine][0] == pytest.approx(0.9)
+    grown = width[~fine] / before[~fine]
+    below, above = np.split(grown, [np.flatnonzero(fine)[0]])
+    for side in (below[::-1], above):  # powers of a common factor
+        assert side == pytest.approx(side[0] ** np.arange(1, len(side) + 1))
+    assert below.max() < 1 < above.min() and width.min() > 0.1249
+    assert all((x == y).all() for x, y in zip(carried(given, np.zeros(2)), given, strict=True))
+
+
+@pytest.mark.parametrize("load", [None, lambda t: 2e3 * t])
+def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(load, tmp_path):
+    """Of a tool that moves as told, and of one under a load, whose way is in the checkpoint."""
+    file, ends = tmp_path / "kept", []
+    for parts in (1, 2):
+        s = pushed(load)
+        result = s.run(0.05, 0.025, progress=False, checkpoint=mpm.Checkpoint(file))
+        if parts == 2:
+            s = pushed(load)
+            result = mpm.resume(s, file)
+        s.run(0.1, 0.025, progress=False, after=result)
+        ends.append((s.points.corners, s.points.pressure, *s.grid.lines))
+        assert (s.grid.lines[1] != s.grid.seeded[1]).any()
+    assert all((one == other).all() for one, other in zip(*ends, strict=True))
+
+
+def test_scenes_in_turn_on_one_grid_do_not_disturb_each_other():
+    def shifted(grid, offset):
+        body = mpm.box(grid, [0, offset], [1.3, 1.0])
+        load = mpm.Traction("top", lambda t: (0, -1e4 * t))
+        return mpm.Simulation(grid, [body], [SOFT], walls={"bottom": "xy"}, conditions=[load])
+
+    both, alone = jumping(2), shifted(jumping(2), 0.0)
+    one, other = shifted(both, 0.0), shifted(both, 0.0)
+    other.step(2.0)
+    for _ in range(2):
+        one.step(1.0)
+        other.step(1.0)
+        alone.step(1.0)
+    assert (one.points.corners == alone.points.corners).all()
+
+
+def test_a_step_keeps_its_cut_by_the_cells_where_it_moves():
+    """A block that is moved by half of STAYS of the coarse cells keeps its cut there; in fine cells it does not."""
+    kept, y = [], np.append(np.linspace(0, 0.1, 21), np.linspace(0.2, 1.2, 11))
+    for low, high in ((0.02, 0.08), (0.5, 0.9)):
+        grid = mpm.Grid(lines=[np.array([0, 0.1]), y])
+        hold = mpm.Displacement("bottom", (0, 0.5 * STAYS * 0.1))
+        body = mpm.box(grid, [0, low], [0.1, high])
+        s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "x", "right": "x"}, conditions=[hold])
+        s.step(1.0)
+        kept.append(s.state.stays)
+    assert kept == [False, True]
+
+
+def test_lines_that_move_less_than_corners_may_keep_the_cut():
+    """And lines that stay do."""
+    for way, resets in ((0.0, 1), (1e-5, 1), (1e-2, 3)):
+        given = [np.array([0, 0.1]), np.linspace(0, 1.2, 13) ** 1.1 * 1.2**-0.1]
+        moved = lambda t, way=way, given=given: [given[0], given[1] + way * t * np.sin(np.pi * given[1] / 1.2) * 0.01]  # noqa: E731
+        grid = mpm.Grid(lines=given, follow=moved)
+        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.1, 1.0])], [SOFT], walls={"bottom": "xy"}, fluid=mpm.Fluid())
+        for _ in range(3):
+            s.step(1.0)
+        assert s.state.resets == resets
+
+
+@pytest.mark.slow
+def test_a_body_carried_through_lines_that_move_against_it_and_back_is_as_one_in_equal_cells():
+    """A wet beam, clamped to a support that moves by its length, and bent on its way: residual stress and pressure."""
+    left, h = [], 0.05
+    given = mpm.graded([-0.6, 0], [2.6, 1.2], [[[0.0, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
+    follow = lambda t: carried(given, np.array([-0.25 * np.sin(np.pi * t), 0.05 * np.sin(4 * np.pi * t)]))  # noqa: E731
+    for grid in (mpm.Grid([-0.6, 0], [2.6, 1.2], [64, 24]), mpm.Grid(lines=given, follow=follow)):
+        hold = mpm.Displacement("left", lambda t: (np.sin(np.pi * t), 0.0))
+        load = mpm.Traction("right", lambda t: (0, -600 * np.sin(np.pi * t)))
+        body, soil = mpm.box(grid, [0.1, 0.5], [0.9, 0.8]), mpm.Hencky(1e6 / 3, 2e5, porosity=0.4, conductivity=1e-4)
+        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={}, conditions=[hold, load])
+        result = s.run(1.0, 1 / 60, progress=False)
+        assert result.balance < 1e-8
+        left.append([np.linalg.norm(s.effective_stress(), axis=(1, 2)).mean(), np.abs(s.points.pressure).max()])
+    assert (np.array(left[1]) < 1.5 * np.array(left[0])).all(), left
+
+
+LINES = [[0, 1, 1.5, 2, 3], [0, 1, 1.5, 2, 3]]
+BALL = mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0, -t))
+
+
+def step(follow, lines=LINES):
+    """Make a step, at t = 1 s, on lines that follow."""
+    grid = mpm.Grid(lines=lines, follow=follow)
+    tool = [follow] if isinstance(follow, mpm.Tool) else []
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=tool)
+    s.t = 1.0
+    s.step(0.1)
+
+
+@pytest.mark.parametrize(
+    "make, name, value",
+    [
+        (lambda: mpm.Grid([0, 0], [1, 1], [2, 2], follow=lambda t: LINES), "grid: follow", "lines"),
+        (lambda: mpm.Grid(lines=LINES, follow=3), "grid: follow", "3"),
+        (lambda: mpm.Grid(lines=LINES, follow=lambda t, X: LINES), "grid: follow", "X"),
+        (lambda: mpm.Grid(lines=[[0, 1, 2], [0, 1, 2]], follow=BALL), "grid: follow", "equal"),
+        (lambda: step(lambda t: [LINES[0][:4], LINES[1]]), "grid: follow at t = 1 s", "4 and 5"),
+        (lambda: step(lambda t: [[0, 1, 1.5, 2, 4], LINES[1]]), "grid: follow at t = 1 s", "4"),
+        (lambda: step(lambda t: [[0, 2, 1, 2.5, 3], LINES[1]]), "lines along x", "[0, 2, 1, 2.5, 3]"),
+        (lambda: step(lambda t: 1 / 0), "grid: follow at t = 1 s", "ZeroDivisionError"),
+        (lambda: step(BALL), "grid: follow", "0 m from a side"),
+        (lambda: step(BALL, [LINES[0], [0, 0.5, 1, 2, 3]]), "grid: follow", "begin at a side"),
+    ],
+)
+def test_lines_that_cannot_follow_are_refused_in_one_line(make, name, value):
+    refused_in_one_line(make, name, value, None, 300)
+
+
+@pytest.mark.slow
+def test_a_cone_meets_the_force_that_it_meets_in_lines_that_are_fine_all_along_its_way():
+    """Blunt, rough, from the surface of clay by two cells, in axisymmetry: the mean over the second half of the way."""
+    clay, h, way, wide = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3), 0.1, 0.2, 0.6
+    forces = []
+    for follow in (False, True):
+        cone = mpm.Tool(mpm.Cone((0, 2.0), (0, 1), 60.0), lambda t: (0, -t), adhesion=300.0)
+        zone = [[0, 2 - wide - (0 if follow else way)], [wide, 2 + wide]]
+        more = {"follow": cone} if follow else {}
+        grid = mpm.Grid(lines=mpm.graded([0, 0], [2, 3], [zone], h, 1.3), axisymmetric=True, **more)
+        body = mpm.box(mpm.Grid([0, 0], [2, 3], [20, 30], axisymmetric=True), [0, 0], [2, 2])
+        walls = {"left": "x", "right": "x", "bottom": "y"}
+        s = mpm.Simulation(grid, [body], [clay], walls=walls, conditions=[cone])
+        result = s.run(way, h / 6, progress=False)
+        forces.append(-result.tool_forces["tool"][1:, 1])
+    mean = [force[len(force) // 2 :].mean() for force in forces]
+    assert mean[1] == pytest.approx(mean[0], rel=0.01), forces
