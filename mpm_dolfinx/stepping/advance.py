@@ -126,7 +126,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                followed = cut.followed(nodal, on_grid.active)
+                followed = cut.followed(nodal, on_grid.active, self._kinks(state.points, cut))
                 points, keeps, folded = self._shaped(state, loads, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
@@ -168,6 +168,12 @@ class Motion:
                 kept["pieces"] = replace(new.pieces, of_cell=carried.of_cell, start=carried.start)
             new = replace(new, stay=replace(stay, keeps=keeps), **kept)
         return new, folded
+
+    def _kinks(self, points: MaterialPoints, cut: CutDomains) -> NDArray[np.bool_] | None:
+        """Return the nodes (nodes,) of cells with yielded soil; None if no law has a history."""
+        if not self._materials.evolves:
+            return None
+        return self._momentum.active_nodes(cut.cells[cut.to_cells(self._materials.evolved(points))])
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t (s), up to a constant.
