@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -173,7 +174,8 @@ class Motion:
         """Return the nodes (nodes,) of cells with yielded soil; None if no law has a history."""
         if not self._materials.evolves:
             return None
-        return self._momentum.active_nodes(cut.cells[cut.to_cells(self._materials.evolved(points))])
+        yields = cut.to_cells(self._materials.evolved(points)) & (cut.pieces_to_cells(cut.pieces.fraction) > NEAR)
+        return self._momentum.active_nodes(cut.cells[yields])  # rounding alone puts no domain into a cell
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t (s), up to a constant.
