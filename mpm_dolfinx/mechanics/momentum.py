@@ -423,11 +423,13 @@ class MomentumProblem:
         self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
         with Timer("mpm: loads"):
-            external, pulls = (
-                forms.summed(1 + room, [getattr(one, name) for one in loads])[system.touched]
-                for room, name in enumerate(("dead", "pulls"))
-            )
-            self._external, self._pulls = external if held is None else external + held[system.touched], pulls
+            external = self._of_loads("dead")
+            self._external = external if held is None else external + held[system.touched]
+            self._pulls = self._of_loads("pulls")
+
+    def _of_loads(self, name: str) -> NDArray[np.float64]:
+        """Return the sums, N, of the loads' forces by a method, on the degrees of freedom `touched`."""
+        return self.forms.summed(1, [getattr(one, name) for one in self.loads])[self.system.touched]
 
     @property
     def linear(self) -> bool:
@@ -450,7 +452,10 @@ class MomentumProblem:
 
     def augment(self) -> bool:
         """Update multipliers and contact geometry of converged loads; return whether any force has changed."""
-        return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
+        changed = any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
+        if changed:
+            self._pulls = self._of_loads("pulls")
+        return changed
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of Newton's method: displacements (active dofs,), m.
