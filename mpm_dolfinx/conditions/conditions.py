@@ -363,10 +363,10 @@ HOLD = 3e2
 """Penalty stiffness for cell means of prescribed displacements, in units of (modulus by `holding`) / (cell size).
 
 The error of the displacement is (change of traction in the step, except by rotation) / (modulus) x cell size / HOLD.
-It does not accumulate, because each step measures it from the prescribed position.  Where it counts multipliers remove
-it, see `given_displacements.LACKS`.
+It does not accumulate, because each step measures it from the prescribed position.  Multipliers remove it where a body
+resists much more stiffly, see `HoldLoads.augment`.
 
-Plateau (soil): halved 8.4e-05, doubled 5.0e-05, cells 2.8e-02.
+Plateau (soil): halved 5.9e-05, doubled 2.0e-05, cells 3.0e-02.
 """
 WEAK = 8.0
 """Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides: penalties on the mean in each cell, and weakly at points; see `held_cells`.
 
-A side that lacks a part of its way gets multipliers, one for each cell and component: the method of multipliers
+A side that lacks a part of its way gets multipliers, one for each cell and component, by the method of multipliers
 (Hestenes 1969, Powell 1969).  They make the means exact, whatever resists.
 """
 
@@ -26,7 +26,7 @@ from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import Displacement, holding, resistance
+from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
 from mpm_dolfinx.domains.cut_domains import CutDomains, Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
@@ -38,12 +38,10 @@ from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
-LACKS = 1e-3
-"""Mean gap of a side after a step, relative to its way in the step, from which on the side gets multipliers."""
 UNDER = 0.125
 """Depth below a side along the grid, in cells, at which a cell must contain the body to hold the side.
 
-Plateau (side): halved 6.9e-03, doubled 1.7e-02, cells 2.4e-01.
+Plateau (side): halved 2.3e-03, doubled 1.6e-02, cells 2.4e-01.
 """
 
 
@@ -129,15 +127,8 @@ class GivenDisplacements(Acting):
         fields = {name: values[row] for name, values in held.moments.items()}
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
         forms = self._forms(HoldForms)
-        return HoldLoads(
-            self,
-            forms,
-            forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields),
-            held,
-            row,
-            own,
-            place,
-        )
+        data = forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields)
+        return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(
         self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
@@ -173,23 +164,19 @@ class GivenDisplacements(Acting):
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
     def _cells(self, cut: CutDomains, p: Patches) -> NDArray[np.int64]:
-        """Return the cells (n,) that hold a side.
+        """Return the cells (n,) that hold a side, `UNDER` it if it is straight along the grid.
 
-        For a side along the grid they contain the body at the depth `UNDER`.  On a grid line, parts of the side lie in
-        cells with only a sliver of the body, whose outer nodes are nearly free.  Their rows would contradict the rows
-        of the cells inside, and move these nodes far.
+        Slivers of the body beyond a grid line have nearly free nodes, which contradictory rows would move far.
         """
-        grid = self._grid
         area0, area = p.area(replace(cut.points, corners=cut.points.origin)), p.area(cut.points)
-        sums = [area0.sum(axis=0), area.sum(axis=0), [np.linalg.norm(area0, axis=1).sum()]]
-        *both, size = over_all(grid.comm, np.concatenate(sums))
-        whole0, whole = np.split(np.array(both), 2)
+        sums = area0.sum(axis=0), area.sum(axis=0), np.linalg.norm(area0, axis=1).sum(keepdims=True)
+        whole0, whole, size = np.split(over_all(self._grid.comm, np.concatenate(sums)), [self._grid.dim, -1])
         axis = int(np.abs(whole).argmax())
-        straight = np.linalg.norm(whole0) >= (1 - ALIGNED) * size
+        straight = np.linalg.norm(whole0) >= (1 - ALIGNED) * size[0]
         if not straight or np.abs(whole[axis]) < (1 - ALIGNED) * np.linalg.norm(whole):
             return p.cell
         x = p.x.copy()
-        x[:, axis] -= np.sign(whole[axis]) * UNDER * grid.sizes_of(p.cell)[..., axis]
+        x[:, axis] -= np.sign(whole[axis]) * UNDER * self._grid.sizes_of(p.cell)[..., axis]
         return cut.cells_at(p.at, x)
 
     def _check_meeting(self, t: float) -> None:
@@ -310,7 +297,8 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces of cell means to their multipliers, on sides that lack a part of their way.
 
-        The updates end if the mean gap no longer falls by half: the cells cannot follow the side any further.
+        Such a body resists its side more stiffly than one cell of it would, as sealed water does.  The updates end if
+        the mean gap no longer falls by half: the cells cannot follow the side any further.
         """
         if not self._place.dt:
             return False
@@ -321,7 +309,8 @@ class HoldLoads(Loads):
         ways = gap, np.abs(self.held.way[self.row, axis])
         sums = np.stack([sum_by(side, weight * way, len(self._lacked)) for way in ways])
         lacks, goes = np.abs(over_all(self.data.points.grid.comm, sums))
-        more = (np.where(np.isinf(self._lacked), LACKS, NEAR) * goes < lacks) & (lacks < self._lacked / 2) & (goes > 0)
+        least = np.where(np.isinf(self._lacked), 1 / HOLD, NEAR)
+        more = (least * goes < lacks) & (lacks < self._lacked / 2) & (goes > 0)
         self._lacked = np.where(more, lacks, self._lacked)
         self.data = self.data.having(gap=self.data["gap"][:, 0] + gap * more[side])
         return bool(more.any())
@@ -337,10 +326,8 @@ class HoldLoads(Loads):
 
     def moved(self, u: fem.Function) -> Loads:
         """Return the same conditions with gaps reduced by a displacement u."""
-        along = self._along(u.x.array.reshape(-1, self._d))
-        data = self.data.having(gap=self.data["gap"][:, 0] - along)
         out = copy(self)
-        out.data = data
+        out.data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
         return out
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -207,11 +207,8 @@ class HeldCells:
             Numbers of conditions that have been reported already, which are left out.
         """
         grid = self.grid
-        comm = self.grid.comm
-        asked = ~np.isin(self.number[row], list(told))
-        row = row[asked]
-        axis = axis[asked]
-        force = force[asked]
+        comm = grid.comm
+        row, axis, force = (values[~np.isin(self.number[row], list(told))] for values in (row, axis, force))
         limit = np.append(self.limit, np.zeros(len(self.number) - len(self.limit)))[row]
         far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])
         suspected = sorted({int(k) for numbers in comm.allgather(far) for k in numbers})

@@ -423,13 +423,8 @@ class MomentumProblem:
         self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
         with Timer("mpm: loads"):
-            external = self._of_loads("dead")
+            external = forms.summed(1, [one.dead for one in loads])[system.touched]
             self._external = external if held is None else external + held[system.touched]
-            self._pulls = self._of_loads("pulls")
-
-    def _of_loads(self, name: str) -> NDArray[np.float64]:
-        """Return the sums, N, of the loads' forces by a method, on the degrees of freedom `touched`."""
-        return self.forms.summed(1, [getattr(one, name) for one in self.loads])[self.system.touched]
 
     @property
     def linear(self) -> bool:
@@ -452,10 +447,7 @@ class MomentumProblem:
 
     def augment(self) -> bool:
         """Update multipliers and contact geometry of converged loads; return whether any force has changed."""
-        changed = any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
-        if changed:
-            self._pulls = self._of_loads("pulls")
-        return changed
+        return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of Newton's method: displacements (active dofs,), m.
@@ -477,7 +469,9 @@ class MomentumProblem:
         system = self.system
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # walls bear the penalty forces of sides next to them
-        b[system.touched] -= self._pulls  # not in the scale: at the start of a step they far exceed the forces
+        if pulls := [one.pulls for one in self.loads if one.stiff]:
+            # not in the scale: at the start of a step they far exceed the forces
+            b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(self.forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
