@@ -265,7 +265,7 @@ def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
     walls = {"left": "x", "right": "x", "bottom": "y"}
     s = mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, conditions=[press])
     moved = s.run(1.0, 1.0, probes=mpm.probes([body], [[0.2, 1.0]]), progress=False).displacement[-1][0, 1]
-    assert -moved == pytest.approx(1e-3, rel=1e-4)
+    assert -moved == pytest.approx(1e-3, rel=1e-5 if fluid else 5e-4)
 
 
 @pytest.mark.parametrize(("bulk", "shear"), [(np.inf, 1e6), (2.2e9, 1e3)])

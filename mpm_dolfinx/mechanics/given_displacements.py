@@ -2,7 +2,7 @@
 """Prescribed displacements of sides: penalties on the mean in each cell, and weakly at points; see `held_cells`.
 
 A side that lacks a part of its way gets multipliers, one for each cell and component, by the method of multipliers
-(Hestenes 1969, Powell 1969).  They make the means exact, whatever resists.
+(Hestenes 1969).  They make the means exact, whatever resists.
 """
 
 from __future__ import annotations
