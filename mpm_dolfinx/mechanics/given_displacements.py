@@ -38,12 +38,6 @@ from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
-UNDER = 0.125
-"""Depth below a side along the grid, in cells, at which a cell must contain the body to hold the side.
-
-Plateau (side): halved 2.3e-03, doubled 1.6e-02, cells 2.4e-01.
-"""
-
 
 class HoldForms:
     """Penalty forms: stiffness, and force towards the prescribed value, at points or for means over points."""
@@ -164,9 +158,10 @@ class GivenDisplacements(Acting):
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
     def _cells(self, cut: CutDomains, p: Patches) -> NDArray[np.int64]:
-        """Return the cells (n,) that hold a side, `UNDER` it if it is straight along the grid.
+        """Return the cells (n,) that hold a side: where it is straight along the grid and crosses a line, inner cells.
 
-        Slivers of the body beyond a grid line have nearly free nodes, which contradictory rows would move far.
+        Slivers of the body beyond the line have nearly free nodes, which contradictory rows would move far.  Inner
+        cells contain the middle of the domain below, and other parts of the side.
         """
         area0, area = p.area(replace(cut.points, corners=cut.points.origin)), p.area(cut.points)
         sums = area0.sum(axis=0), area.sum(axis=0), np.linalg.norm(area0, axis=1).sum(keepdims=True)
@@ -176,8 +171,11 @@ class GivenDisplacements(Acting):
         if not straight or np.abs(whole[axis]) < (1 - ALIGNED) * np.linalg.norm(whole):
             return p.cell
         x = p.x.copy()
-        x[:, axis] -= np.sign(whole[axis]) * UNDER * self._grid.sizes_of(p.cell)[..., axis]
-        return cut.cells_at(p.at, x)
+        x[:, axis] = cut.points.x[p.at, axis]
+        under, shape = cut.cells_at(p.at, x), tuple(self._grid.shape)
+        layer, below = (np.unravel_index(cells % self._grid.cells, shape)[axis] for cells in (p.cell, under))
+        holds = over_all(self._grid.comm, np.bincount(layer, minlength=shape[axis])) > 0
+        return np.where(holds[below], under, p.cell)
 
     def _check_meeting(self, t: float) -> None:
         """Refuse prescribed displacements that differ where two sides meet: the stress there would be infinite."""
