@@ -112,12 +112,12 @@ def test_a_slanted_block_under_uniform_stress_is_exact():
 
 
 def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
-    """Return the reaction over the way, N/m^2, of a side pushed by so many cells, at the end and held for ten steps."""
+    """Return the reaction over the way, N/m^2, of a side pushed by so many cells: at once, held for a step, for ten."""
     grid = mpm.Grid([0, 0], [2.5, 1.2], [round(2.5 / h), round(1.2 / h)])
     wall = mpm.Displacement("left", lambda t, X: (way * h * min(t, 1.0), 0), "x")
     s = mpm.Simulation(grid, [mpm.box(grid, [start, 0], [2, 1])], [SOIL], walls={"bottom": "xy"}, conditions=[wall])
     found = []
-    for end, dt in ((1.0, 1 / steps), (11.0, 1.0)):
+    for end, dt in ((1.0, 1 / steps), (2.0, 1.0), (11.0, 1.0)):
         s.run(end, dt, progress=False)
         found.append(s.reactions.array[0, 0] / (way * h))
     return found
@@ -127,9 +127,12 @@ def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_l
     """It carried from 1 to 1.9 times as much: wall nodes bear the counted force, and bend the prescribed field."""
     ways, lines = [(0.001, 1), (0.1, 4), (0.5, 1), (0.5, 10)], (0.5, 0.55, 0.575)
     loads = np.array([[pushed_along_a_rough_base(*way, line) for way in ways] for line in lines])
-    print(f"rows: lines, columns: (ways over h, steps)\nat the end\n{loads[..., 0]}\nheld\n{loads[..., 1]}")
-    assert loads == pytest.approx(loads.mean(), rel=0.07)
-    assert loads[:, 3, 1] == pytest.approx(loads[:, 3, 0], rel=0.03)
+    print(
+        f"rows: lines, columns: (ways over h, steps); at once, held for one step, for ten\n{loads.transpose(2, 0, 1)}"
+    )
+    assert loads == pytest.approx(loads.mean(), rel=0.06)
+    assert loads[..., 1] == pytest.approx(loads[..., 0], rel=0.025)
+    assert loads[..., 2] == pytest.approx(loads[..., 1], rel=0.007)
 
 
 def test_a_side_one_cell_high_on_a_rough_base_is_held_too():
@@ -262,7 +265,7 @@ def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
     walls = {"left": "x", "right": "x", "bottom": "y"}
     s = mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, conditions=[press])
     moved = s.run(1.0, 1.0, probes=mpm.probes([body], [[0.2, 1.0]]), progress=False).displacement[-1][0, 1]
-    assert -moved == pytest.approx(1e-3, rel=1e-2 if fluid else 1e-3)
+    assert -moved == pytest.approx(1e-3, rel=1e-5 if fluid else 5e-4)
 
 
 @pytest.mark.parametrize(("bulk", "shear"), [(np.inf, 1e6), (2.2e9, 1e3)])

@@ -72,6 +72,8 @@ CHANGES = {
     ("SideFeeds", "_flows"): "the active set of seepage faces",
     ("SideFeeds", "_aslant"): "what flows aslant at the start of the substep",
     ("SideFeeds", "_share"): "the same, as a share of what flows in soil whose pores drain",
+    ("HoldLoads", "data"): "the rows of held sides with their multipliers",
+    ("HoldLoads", "_lacked"): "what sides lacked of their way when their multipliers were last changed",
     ("ContactProblem", "now"): "the pairs and tractions of contacts as they are held for a Newton step",
     ("FreeTools", "now"): "the same, and where tools with a mass are",
     ("Events", "_before"): "what events were before the step",

@@ -173,7 +173,7 @@ class Loads:
         """Add forces that are constant in the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant forces of the penalty, which do not enter the scale of residuals."""
+        """Add the forces of the penalty that do not depend on u; they do not enter the scale of residuals."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""

@@ -363,7 +363,8 @@ HOLD = 3e2
 """Penalty stiffness for cell means of prescribed displacements, in units of (modulus by `holding`) / (cell size).
 
 The error of the displacement is (change of traction in the step, except by rotation) / (modulus) x cell size / HOLD.
-It does not accumulate, because each step measures it from the prescribed position.
+It does not accumulate, because each step measures it from the prescribed position.  Multipliers remove it where a body
+resists much more stiffly, see `HoldLoads.augment`.
 
 Plateau (soil): halved 5.9e-05, doubled 2.0e-05, cells 3.0e-02.
 """

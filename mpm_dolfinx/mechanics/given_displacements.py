@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides: penalties on the mean in each cell, and weakly at points; see `held_cells`."""
+"""Prescribed displacements of sides: penalties on the mean in each cell, and weakly at points; see `held_cells`.
+
+A side that lacks a part of its way gets multipliers, one for each cell and component, by the method of multipliers
+(Hestenes 1969).  They make the means exact, whatever resists.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import replace
 from itertools import combinations
 
 from mpi4py import MPI
@@ -20,12 +26,12 @@ from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import Displacement, holding, resistance
+from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
-from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.domains.cut_domains import CutDomains, Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.held_cells import ALIGNED, HeldCells, HeldPoints
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
@@ -115,15 +121,8 @@ class GivenDisplacements(Acting):
         fields = {name: values[row] for name, values in held.moments.items()}
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
         forms = self._forms(HoldForms)
-        return HoldLoads(
-            self,
-            forms,
-            forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields),
-            held,
-            row,
-            own,
-            place,
-        )
+        data = forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields)
+        return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(
         self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
@@ -152,10 +151,31 @@ class GivenDisplacements(Acting):
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
-            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)))
+            values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
+            rows.append((self._cells(cut, p), p.x, values))
         cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
         number, *own = values[:, :6].T
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
+
+    def _cells(self, cut: CutDomains, p: Patches) -> NDArray[np.int64]:
+        """Return the cells (n,) that hold a side: where it is straight along the grid and crosses a line, inner cells.
+
+        Slivers of the body beyond the line have nearly free nodes, which contradictory rows would move far.  Inner
+        cells contain the middle of the domain below, and other parts of the side.
+        """
+        area0, area = p.area(replace(cut.points, corners=cut.points.origin)), p.area(cut.points)
+        sums = area0.sum(axis=0), area.sum(axis=0), np.linalg.norm(area0, axis=1).sum(keepdims=True)
+        whole0, whole, size = np.split(over_all(self._grid.comm, np.concatenate(sums)), [self._grid.dim, -1])
+        axis = int(np.abs(whole).argmax())
+        straight = np.linalg.norm(whole0) >= (1 - ALIGNED) * size[0]
+        if not straight or np.abs(whole[axis]) < (1 - ALIGNED) * np.linalg.norm(whole):
+            return p.cell
+        x = p.x.copy()
+        x[:, axis] = cut.points.x[p.at, axis]
+        under, shape = cut.cells_at(p.at, x), tuple(self._grid.shape)
+        layer, below = (np.unravel_index(cells % self._grid.cells, shape)[axis] for cells in (p.cell, under))
+        holds = over_all(self._grid.comm, np.bincount(layer, minlength=shape[axis])) > 0
+        return np.where(holds[below], under, p.cell)
 
     def _check_meeting(self, t: float) -> None:
         """Refuse prescribed displacements that differ where two sides meet: the stress there would be infinite."""
@@ -269,6 +289,29 @@ class HoldLoads(Loads):
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
+        self._asked = data["gap"][:, 0]  # of means, whose gaps have no other part at first
+        self._lacked = np.full(len(acting.held) * self._d, np.inf)
+
+    def augment(self, at: At) -> bool:
+        """Add the penalty forces of cell means to their multipliers, on sides that lack a part of their way.
+
+        Such a body resists its side more stiffly than one cell of it would, as sealed water does.  The updates end if
+        the mean gap no longer falls by half: the cells cannot follow the side any further.
+        """
+        if not self._place.dt:
+            return False
+        means, axis = self.row < len(self.held.limit), self.data["direction"].argmax(axis=1)
+        side = self._d * self.held.number[self.row] + axis
+        weight = np.where(means, self.data["stiffness"][:, 0], 0.0)
+        gap = np.where(means, self._asked - self._along(at.nodal), 0.0)
+        ways = gap, np.abs(self.held.way[self.row, axis])
+        sums = np.stack([sum_by(side, weight * way, len(self._lacked)) for way in ways])
+        lacks, goes = np.abs(over_all(self.data.points.grid.comm, sums))
+        least = np.where(np.isinf(self._lacked), 1 / HOLD, NEAR)
+        more = (least * goes < lacks) & (lacks < self._lacked / 2) & (goes > 0)
+        self._lacked = np.where(more, lacks, self._lacked)
+        self.data = self.data.having(gap=self.data["gap"][:, 0] + gap * more[side])
+        return bool(more.any())
 
     def pulls(self, b: NDArray[np.float64]) -> None:
         """Add the forces towards the prescribed displacements."""
@@ -281,8 +324,9 @@ class HoldLoads(Loads):
 
     def moved(self, u: fem.Function) -> Loads:
         """Return the same conditions with gaps reduced by a displacement u."""
-        data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
-        return HoldLoads(self._acting, self._forms, data, self.held, self.row, self.share, self._place)
+        out = copy(self)
+        out.data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
+        return out
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m,), m, along each prescribed component, at nodal values u (nodes, d), m."""

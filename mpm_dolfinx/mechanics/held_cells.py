@@ -77,6 +77,8 @@ class HeldCells:
     stiffness, limit
         By component: penalty stiffness, N/m, normal to a side along the grid with the confined modulus; and for means
         the largest plausible force, N. Larger forces are artefacts.
+    way
+        Of each row: increment (d,) of the prescribed displacement in the step, m.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):
@@ -124,6 +126,7 @@ class HeldCells:
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
         self._given, self._rise = both(given, given[at]), both(rise, rise[at])
         self._x = both(x, x[at])
+        self.way = np.diff(self._given.reshape(-1, 2, grid.dim), axis=1)[:, 0]
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the rows that prescribe a component, with stiffness, gap and nodal fractions.
@@ -131,7 +134,7 @@ class HeldCells:
         A row leaves out nodes that a wall fixes, if the side runs into the wall. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. Some sides move at such a wall by more
         than half of their displacement in the cell, at the start or the end of the step. The displacement then bends
-        over this cell. The row is dropped if other rows already hold all of its free nodes.
+        over this cell. The row is dropped if other rows already hold some of its free nodes.
 
         Parameters
         ----------
@@ -171,7 +174,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the rows (k,) with nodes at a wall whose other nodes all have rows without such nodes.
+        """Return the rows (k,) with nodes at a wall, and others that also have rows without nodes at a wall.
 
         number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): nodes at the wall.
         """
@@ -185,7 +188,7 @@ class HeldCells:
         key = place + number[:, None] * np.prod(shape)
         asked = np.unique(np.concatenate(grid.comm.allgather(key[(some & ~stuck) & at_wall[:, None]])))
         found = over_all(grid.comm, np.isin(asked, key[some & ~at_wall[:, None]]).astype(np.int64)) > 0
-        return at_wall & (among(key, asked[found]) | ~some | stuck).all(axis=1)
+        return at_wall & (among(key, asked[found]) & some & ~stuck).any(axis=1)
 
     def beyond(
         self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]
@@ -204,11 +207,8 @@ class HeldCells:
             Numbers of conditions that have been reported already, which are left out.
         """
         grid = self.grid
-        comm = self.grid.comm
-        asked = ~np.isin(self.number[row], list(told))
-        row = row[asked]
-        axis = axis[asked]
-        force = force[asked]
+        comm = grid.comm
+        row, axis, force = (values[~np.isin(self.number[row], list(told))] for values in (row, axis, force))
         limit = np.append(self.limit, np.zeros(len(self.number) - len(self.limit)))[row]
         far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])
         suspected = sorted({int(k) for numbers in comm.allgather(far) for k in numbers})

@@ -428,11 +428,8 @@ class MomentumProblem:
         self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
         with Timer("mpm: loads"):
-            external, pulls = (
-                forms.summed(1 + room, [getattr(one, name) for one in loads])[system.touched]
-                for room, name in enumerate(("dead", "pulls"))
-            )
-            self._external, self._pulls = external if held is None else external + held[system.touched], pulls
+            external = forms.summed(1, [one.dead for one in loads])[system.touched]
+            self._external = external if held is None else external + held[system.touched]
 
     @property
     def linear(self) -> bool:
@@ -477,7 +474,9 @@ class MomentumProblem:
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # walls bear the penalty forces of sides next to them
-        b[system.touched] -= self._pulls  # not in the scale: at the start of a step they far exceed the forces
+        if pulls := [one.pulls for one in self.loads if one.stiff]:
+            # not in the scale: at the start of a step they far exceed the forces
+            b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.nodal.ravel(), system.step)
         system.penalty.multAdd(step, r, r)

@@ -240,10 +240,10 @@ class Newton:
         went: NDArray[np.float64] | float = 0.0
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
-            if found is not errors:  # converged, but contacts have changed
+            if found is not errors:  # converged, but contacts or multipliers have changed
                 errors = found
                 count = 0
-                fresh = True
+                fresh |= any(one.touches for one in self._momentum.loads)
             if elastic or fresh:
                 self._check(max(count, self.report.newton // REBALANCED), "newton")
             if fresh and self._linear and not self.report.newton:
