@@ -107,8 +107,11 @@ class DrainedSides(Feeding):
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
             given, n = everywhere(grid, partial(outlet.through, wet.t, on_side(p, wet.points))), len(p.x)
-            columns = [np.resize(column, (n, 1)) for column in (i, *given)]
-            rows.append((p.cell, p.x, np.concatenate([*columns, p.area(wet.points)], axis=1)))
+            columns = np.empty((n, 5 + grid.dim))
+            for k, column in enumerate((i, *given)):
+                columns[:, k] = column
+            columns[:, 5:] = p.area(wet.points)
+            rows.append((p.cell, p.x, columns))
         cell, x, values = gathered(grid, rows, 5 + grid.dim)
         number = values[:, 0].astype(np.int64)
         pressure, flux, one_way, driest = values[:, 1:5].T
@@ -221,7 +224,7 @@ class RainedFaces(OpenFaces):
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
         wet = self.pond.outflow(fluid)
-        return np.where(np.isnan(self.rain), wet, np.clip(-self.rain, wet, self.dry.outflow(fluid)))
+        return np.where(np.isnan(self.rain), wet, np.minimum(np.maximum(-self.rain, wet), self.dry.outflow(fluid)))
 
     def aslant(
         self, fluid: Fluid, beyond: NDArray[np.float64]
@@ -324,9 +327,9 @@ class SideFeeds(Feeds):
         through, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             through = through + at.driven(fluid)
-        turnover = sum_by(at.at, counts * at.open_by(fluid), len(fluid.pi)) * np.abs(fluid.pi)
-        gain = sum_by(at.at, np.abs(through), len(fluid.pi)) if self._drain else 0.0  # steady rain changes nothing
-        return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover, gain)
+        rows = np.array([through, counts * at.open_by(fluid), np.abs(through) * self._drain])
+        cells, turnover, gain = sum_by(at.at, rows, len(fluid.pi))
+        return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # steady rain changes nothing: it has no gain
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow."""

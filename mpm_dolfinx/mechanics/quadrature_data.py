@@ -47,7 +47,7 @@ much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % t
 def told_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
     """Return the weight of the corner-based volume ratio at the start of a step in the cells of a material."""
     stiffness = material.oedometric / material.shear
-    return np.clip(2 - stiffness / STIFF, 0.0, 1.0) if wet else np.minimum(1.0, TOLD / stiffness)
+    return np.minimum(np.maximum(2 - stiffness / STIFF, 0.0), 1.0) if wet else np.minimum(1.0, TOLD / stiffness)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class QuadraturePoints:
         seen = self._seen(cut, pieces)
         if len(self.laws) > 1 or seen is not pieces:
             part = cut.to_cells(self._scene.part_of(cut.points))
-            rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
+            rows = [(part == number).nonzero()[0] for number in range(len(self.laws))]
             parts = [(own, seen.part(own)) for own in rows]
         return PiecePlaces(pieces, tuple(parts))
 
