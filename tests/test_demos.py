@@ -47,6 +47,7 @@ QUICK = {
     "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "landslide": ("--cells 4 --dt 0.2", ["landslide.png"]),
+    "collapse": ("--aspects 0.5 --finer 0.5 --steps 13", ["collapse.png"]),
     "falling": ("--cells 3 --dt 0.02", ["falling.png"]),
     "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
     "drainage": ("--cells 10 --step 120", ["drainage.png"]),
@@ -66,6 +67,7 @@ QUICK = {
 }
 # what they show has tests of its own, or takes long to compile
 LONG = {"slump", "water_table", "cavity", "footing", "slope", "image", "falling", "landslide", "vibration", "wave"}
+LONG |= {"collapse"}
 
 
 def run(demo, arguments):
