@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The fluid counted from the points, porosity times density times volume less the defect, equals the inflow."""
+"""The fluid counted from the points equals the inflow: porosity times density times volume, less the volume defect.
+
+The density is the mean over the pieces of a point's domain, by their pressures.
+"""
 
 import numpy as np
 import pytest
@@ -13,8 +16,11 @@ RIM = {2: ([-1, 1.6], [0.6, 1.9]), 3: ([-1, -1, 0.7], [0.5, 0.5, 1.1])}  # m, be
 
 def fluid_of(s):
     """Return the fluid of the points, m^d at zero pressure, and by how much it has been exchanged since the start."""
-    p, bulk = s.points, s.scene.fluid.bulk
-    fluid = p.volume0 * (p.J - 1 + POROSITY) * np.exp(p.pressure / bulk)
+    p, pieces = s.points, s.state.pieces
+    pressure = pieces.of_cell if pieces.pressure is None else pieces.pressure
+    density = pieces.fraction * np.exp(pressure / s.scene.fluid.bulk)
+    density = np.bincount(np.searchsorted(p.id, pieces.id), density, minlength=len(p))
+    fluid = p.volume0 * (p.J - 1 + POROSITY) * density
     return (fluid - p.volume0 * p.data["owed"]).sum(), np.abs(fluid - POROSITY * p.volume0).sum()
 
 
@@ -45,8 +51,8 @@ OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.
     "scene",
     [
         {"dilation": 5.0},
-        {"dilation": 5.0, "bulk": 2.2e9},
-        {"axisymmetric": True},
+        {"dilation": 5.0, "bulk": 1e7},
+        {"axisymmetric": True, "bulk": 2.2e9},
         {"dim": 3},
         {"numerics": mpm.Numerics(method="backward-euler"), **OPEN},
         {"numerics": mpm.Numerics(method="backward-euler"), "terms": [mpm.Source(source)], "bulk": 2.2e9, **OPEN},
@@ -56,18 +62,19 @@ OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.
 def test_yielding_soil_keeps_its_fluid(scene):
     """Yielded soil had no volume defect before: 3 % of the exchanged fluid was lost, 2 % with deep footings.
 
-    Pressures of points are means over their domains, cells store by porosity: this causes the error of compressible
-    fluid.
+    On a new grid cells weighed pressures by the volumes that they see: 3e-8 of a fluid of 10 MPa was lost.
     """
     s, steps = footing(**scene), 5
     start, came = fluid_of(s)[0], 0.0
     for _ in range(steps):
+        volume = (s.points.volume0 * s.points.J).sum()
         s.step(1 / steps)
         came -= s.outflows.array.sum() / steps
         if "terms" in scene:
-            came += 1e-6 * s.t / steps * (s.points.volume0 * s.points.J).sum()
+            came += 1e-6 * s.t / steps * volume
     now, exchanged = fluid_of(s)
     off = abs(now - start - came) / exchanged
     print(f"fluid off by {off:.1e} of {exchanged:.2g} that was exchanged")
     assert s.scene.materials.evolved(s.points).mean() > 0.2
-    assert off < (1e-8 if "bulk" not in scene else 1e-6)
+    assert off < 1e-8
+    assert abs(s.cells().water.sum() - now) < 1e-8 * exchanged

@@ -237,10 +237,12 @@ class OnGrid(Keyed):
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means in the filled owned cells of potentials (m,), Pa, of their pieces.
 
-        The weight is the storage, or the volume in a cell without storage.
+        The weight is the storage of the points, so their fluid is kept, or the volume in a cell without storage.
         """
-        contents, cells = self.contents, self.cut.cells
-        potential, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
+        contents, cells, points = self.contents, self.cut.cells, self.cut.points
+        held = self._quadrature.materials.storage(points) * points.volume0 * points.J
+        store = self.cut.pieces.fraction * held[self.cut.pieces.point]
+        potential, store = (self.cut.pieces_to_cells(rows) for rows in (at_pieces, store))
         held, mean = contents.total(cells, store), contents.mean(potential)
         return np.divide(contents.total(cells, store * potential), held, out=mean, where=held > 0)
 
