@@ -111,20 +111,25 @@ def quick(seed: int) -> Scene:
     return drawn(seed, dim=2, axisymmetric=seed % 4 == 0, laws=LAWS[seed % len(LAWS)])
 
 
+def tell(text: str) -> None:
+    """Print at once, also from workers of pytest-xdist, which show what goes to stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def reported(scenes) -> Counter:
     """Try scenes each in a frame of its own; print what became of each as soon as it did; return how many are what."""
     count, why = Counter(), Counter()
     for scene in scenes:
         began, frame = time.perf_counter(), composite(scene, 0)
         outcome = tried(scene, frame)
-        print(f"{outcome.kind} after {time.perf_counter() - began:.0f} s: {scene.line()}", file=sys.stderr, flush=True)
+        tell(f"{outcome.kind} after {time.perf_counter() - began:.0f} s: {scene.line()}")
         count[outcome.kind] += 1
         for name in frame.named():
             why[name, "in all"] += 1
         for name in outcome.apart:
             why[name, outcome.kind] += 1
         if outcome.kind in ("differs", "chaotic", "steps"):
-            print("\n" + line(scene, frame, outcome), file=sys.stderr, flush=True)
+            tell("\n" + line(scene, frame, outcome))
     print(f"\n{dict(count)}; by transformation: " + ", ".join(f"{' '.join(k)} {n}" for k, n in sorted(why.items())))
     return count
 
@@ -244,7 +249,7 @@ def ledgers(scenes) -> list[tuple[Scene, Ledger]]:
             counted(scene, ledger)
         except (ValueError, mpm.NotConverged, mpm.LeftGrid):
             continue
-        print(f"forces off by {ledger.off:.1e}, fluid by {ledger.leaked:.1e}: {scene.line()}", file=sys.stderr, flush=True)
+        tell(f"forces off by {ledger.off:.1e}, fluid by {ledger.leaked:.1e}: {scene.line()}")
         out.append((scene, ledger))
     return out
 
