@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Measures of the project's English: `python -m tests.prose` prints them, with `--show PART` the sentences.
+"""Measures of the project's English: `python -m tests.prose` prints them.
+
+    python -m tests.prose --show PART               # the long and the vague sentences of a part
+    python -m tests.prose --draw 300 --seed 1       # sentences drawn at random, with their places, for a reader
 
 Text is that of docstrings and of pages without code, tables' rules, comments and formulas.  Code in a sentence counts
 as one word.  *Vague* words are those behind which a noun is missing or far away.  A sentence ends at a full stop, a
@@ -9,41 +12,74 @@ colon, or at the end of a paragraph, of an item or of a cell of a table.
 import ast
 import re
 import sys
+from argparse import ArgumentParser
 from pathlib import Path
+from random import Random
 from statistics import median
 
 ROOT = Path(__file__).parents[1]
 VAGUE = re.compile(r"\b(what|those|beside|besides|of which)\b", re.IGNORECASE)
 LONG = 25
 """Words of the longest sentence that is easily read."""
+ENTRY = re.compile(r"^( *)(\S.{0,60}[^.:\s])\n\1 {4}(?=\S)", re.M)
+"""A name of a list of parameters, and its text below."""
+SHORTEST = 4
+"""Words of the shortest sentence that is drawn."""
 PARTS = {
-    "package": lambda: docstrings(sorted((ROOT / "mpm_dolfinx").rglob("*.py"))),
-    "demos": lambda: docstrings(sorted((ROOT / "demos").rglob("*.py"))),
+    "package": lambda: docstrings(files("mpm_dolfinx")),
+    "demos": lambda: docstrings(files("demos")),
     "front page": lambda: page(ROOT / "README.md"),
     "demos page": lambda: page(ROOT / "demos" / "README.md"),
     "method page": lambda: page(ROOT / "mpm_dolfinx" / "README.md"),
 }
+PAGES = ("README.md", "demos/README.md", "mpm_dolfinx/README.md")
+
+
+def files(folder: str) -> list[Path]:
+    """Return the Python files of a folder of the project."""
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+def texts(tree: ast.AST) -> list[tuple[int, str]]:
+    """Return the lines and the values of all docstrings, also of the strings below values."""
+    bodies = [node.body for node in ast.walk(tree) if isinstance(getattr(node, "body", None), list)]
+    values = [child.value for body in bodies for child in body if isinstance(child, ast.Expr)]
+    return [(each.lineno, each.value) for each in values if isinstance(each, ast.Constant) and type(each.value) is str]
 
 
 def docstrings(paths: list[Path]) -> list[str]:
     """Return the paragraphs of all docstrings, also of the strings below values."""
+    return [each for path in paths for _, text in texts(ast.parse(path.read_text())) for each in paragraphs(text)]
+
+
+def messages(tree: ast.AST) -> list[tuple[int, str]]:
+    """Return the lines and the texts of messages: of errors and of warnings, a value in them is `code`."""
     out = []
-    for path in paths:
-        for node in ast.walk(ast.parse(path.read_text())):
-            body = getattr(node, "body", None)
-            for child in body if isinstance(body, list) else ():
-                if (
-                    isinstance(child, ast.Expr)
-                    and isinstance(child.value, ast.Constant)
-                    and type(child.value.value) is str
-                ):
-                    out += paragraphs(child.value.value)
-    return out
+    for node in ast.walk(tree):
+        warns = isinstance(node, ast.Call) and re.search(r"(warn\w*|refuse\w*)$", ast.unparse(node.func))
+        parts = set()
+        for each in ast.walk(node) if isinstance(node, ast.Raise) or warns else ():
+            if each in parts:
+                continue
+            if isinstance(each, ast.JoinedStr):
+                parts.update(ast.walk(each))
+                text = [
+                    str(v.value) if isinstance(v, ast.Constant) else f"`{ast.unparse(v.value)}`" for v in each.values
+                ]
+                out.append((each.lineno, "".join(text)))
+            elif isinstance(each, ast.Constant) and isinstance(each.value, str):
+                out.append((each.lineno, each.value))
+    return sorted(set(out))
 
 
 def page(path: Path) -> list[str]:
     """Return the paragraphs of a page, items and cells of tables among them."""
-    text = path.read_text().partition("\n## References\n")[0]
+    return page_paragraphs(path.read_text())
+
+
+def page_paragraphs(text: str) -> list[str]:
+    """Return the paragraphs of the text of a page."""
+    text = text.partition("\n## References\n")[0]
     text = re.sub(r"```.*?```|<!--.*?-->|\$\$.*?\$\$|<[^>]+>", " ", text, flags=re.S)
     text = re.sub(r"^ {4}.*$", "", text, flags=re.M)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
@@ -85,11 +121,61 @@ def poor(texts: list[str]) -> list[str]:
     return out
 
 
+def whole_sentences(paragraph: str) -> list[str]:
+    """Return the sentences of a paragraph as they stand, of at least `SHORTEST` words without code.
+
+    Here, a colon does not end a sentence.
+    """
+    code = iter(re.findall(r"``?[^`]+``?", paragraph))
+    parts = re.split(r"(?<=[.!?])\s+(?![a-z])", re.sub(r"``?[^`]+``?", "\0", paragraph))
+    whole = [part for part in parts if len(re.findall(r"[^\W\d_]+", part)) >= SHORTEST]
+    shown = {part: re.sub("\0", lambda _: next(code), part) for part in parts}
+    return [shown[part] for part in whole]
+
+
+def places() -> list[tuple[str, str]]:
+    """Return the places, file:line, and all sentences of docstrings, messages and pages."""
+    out = []
+    for path in [*files("mpm_dolfinx"), *files("demos"), *(ROOT / page for page in PAGES)]:
+        source = path.read_text()
+        if path.suffix == ".md":
+            found = [(1, each) for each in page_paragraphs(source)]
+        else:
+            tree = ast.parse(source)
+            docs = [(line, each) for line, text in texts(tree) for each in paragraphs(ENTRY.sub(r"\n\1\2: ", text))]
+            found = docs + [(line, " ".join(text.split())) for line, text in messages(tree)]
+        out += [(place(path, source, line, each), each) for line, text in found for each in whole_sentences(text)]
+    return out
+
+
+def place(path: Path, source: str, line: int, sentence: str) -> str:
+    """Return file:line of a sentence that begins at or below a line."""
+    start = re.match(rf"(.*\n){{{line - 1}}}", source).end()
+    words = r"[\W\d_]+".join(re.findall(r"[^\W\d_]+", sentence)[:5])
+    found = re.search(words, source[start:])
+    return f"{path.relative_to(ROOT)}:{line + (source.count(chr(10), start, start + found.start()) if found else 0)}"
+
+
+def draw(count: int, seed: int) -> list[str]:
+    """Return sentences drawn at random without repetition, with their places."""
+    unique = {sentence: where for where, sentence in reversed(places())}
+    drawn = Random(seed).sample(sorted(unique), count)
+    return [f"{i + 1}. [{unique[each]}] {each}" for i, each in enumerate(drawn)]
+
+
 if __name__ == "__main__":
-    if "--show" in sys.argv:
-        print("\n".join(poor(PARTS[sys.argv[sys.argv.index("--show") + 1]]())))
+    parser = ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--show", choices=PARTS, help="print the long and the vague sentences of a part")
+    parser.add_argument("--draw", type=int, default=0, help="print so many sentences drawn at random")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the drawn sentences")
+    args = parser.parse_args()
+    if args.show:
+        print("\n".join(poor(PARTS[args.show]())))
+        sys.exit()
+    if args.draw:
+        print("\n".join(draw(args.draw, args.seed)))
         sys.exit()
     print(f"{'':12} {'words':>7} {'vague/1000':>11} {'long %':>7} {'median':>7}")
-    for part, texts in PARTS.items():
-        m = measures(texts())
+    for part, found in PARTS.items():
+        m = measures(found())
         print(f"{part:12} {m['words']:7d} {m['vague']:11.2f} {m['long']:7.2f} {m['median']:7.0f}")

@@ -135,6 +135,13 @@ def compiled(tmp_path_factory):
     return cache
 
 
+def test_a_second_run_compiles_nothing(compiled, tmp_path):
+    cache = shutil.copytree(compiled, tmp_path / "cache")
+    assert ended(start(XDG_CACHE_HOME=cache)) == ONE
+    first, second = ({file.name for file in each.glob("fenics/*.c")} for each in (compiled, cache))
+    assert first == second != set(), "the name of a library depends on the libraries compiled before it"
+
+
 def unfinished(age):
     def damage(library, source):
         source.with_suffix(".c.cached").unlink()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The English of pages and docstrings: vague words and long sentences only become fewer."""
 
+import re
+
 import pytest
 
 from tests import prose
@@ -29,3 +31,13 @@ def test_vague_words_and_long_sentences_are_counted():
         found["words"] == 37 and found["vague"] == pytest.approx(3000 / 37) and found["long"] == pytest.approx(100 / 3)
     )
     assert len(prose.poor(texts)) == 4
+
+
+def test_drawn_sentences_stand_where_they_are_said_to():
+    drawn = prose.draw(200, seed=1)
+    assert drawn == prose.draw(200, seed=1) != prose.draw(200, seed=2)
+    for each in drawn:
+        path, line, sentence = re.fullmatch(r"\d+\. \[(.+):(\d+)\] (.+)", each).groups()
+        below = " ".join((prose.ROOT / path).read_text().splitlines()[int(line) - 1 :])
+        words = [re.findall(r"[^\W\d_]+", re.sub(r"`.*?`", "", text)) for text in (sentence, below)]
+        assert set(words[0]) <= set(words[1])

@@ -52,7 +52,8 @@ def box_mesh(
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
     if OLD:
-        domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1))
+        # FFCx sets this variant when it first compiles a form, which would change the names of later libraries
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1, variant="equispaced"))
         ghosts = mesh.GhostMode.shared_facet
         lists = cpp.graph.AdjacencyList_int32(*where)
         return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
