@@ -239,7 +239,8 @@ class OnGrid(Keyed):
 
         The weight is the storage of the points, so their fluid is kept, or the volume in a cell without storage.
         """
-        contents, cells, points = self.contents, self.cut.cells, self.cut.points
+        contents, cells = self.contents, self.cut.cells
+        points = self.cut.points
         held = self._quadrature.materials.storage(points) * points.volume0 * points.J
         store = self.cut.pieces.fraction * held[self.cut.pieces.point]
         potential, store = (self.cut.pieces_to_cells(rows) for rows in (at_pieces, store))
