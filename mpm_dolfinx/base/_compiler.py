@@ -17,8 +17,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from uuid import uuid4
 
 from mpi4py import MPI
@@ -124,7 +127,8 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
             for place in dict.fromkeys((Path(cache_dir), folder)):
                 with suppress(OSError, ImportError, AttributeError):  # unreadable, or another file of this name
                     if _is_whole(place, name):
-                        return find(name, names, place, timeout)
+                        module = _loaded(name, _library(place, name))
+                        return [getattr(module.lib, one) for one in names], module
             return find(name, names, workshop, timeout)  # makes the workshop, which is empty
 
         try:
@@ -148,6 +152,15 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
             shutil.rmtree(workshop, ignore_errors=True)
 
     return find_or_make
+
+
+@cache
+def _loaded(name: str, library: Path) -> ModuleType:
+    """Return the module of a library; FFCx's way lists all of the cache, for each form of each scene."""
+    spec = spec_from_file_location(name, library)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _library(place: Path, name: str) -> Path | None:

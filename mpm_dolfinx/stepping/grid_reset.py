@@ -234,10 +234,11 @@ class OnGrid(Keyed):
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means in the filled owned cells of potentials (m,), Pa, of their pieces.
 
-        The weight is the storage, or the volume in a cell without storage.
+        The weight is the storage of the points, so their fluid is kept, or the volume in a cell without storage.
         """
-        contents = self.contents
-        potential, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
+        contents, points, pieces = self.contents, self.cut.points, self.cut.pieces
+        store = pieces.fraction * (self._quadrature.materials.storage(points) * points.volume0 * points.J)[pieces.point]
+        potential, store = map(self.cut.pieces_to_cells, (at_pieces, store))
         held, mean = contents.total(store), contents.mean(potential)
         return np.divide(contents.total(store * potential), held, out=mean, where=held > 0)
 

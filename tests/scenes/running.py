@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import ufl
+from dolfinx import fem
 from helpers import without
 from numpy.typing import NDArray
 
@@ -207,12 +208,12 @@ class _Builder:
 
             def springs(points, u):
                 U = points.displacement + points.value(u)
-                return stiffness * ufl.inner(U, U) / ufl.det(points.F) * points.dx
+                return _constant(points, stiffness) * ufl.inner(U, U) / ufl.det(points.F) * points.dx
 
             out["terms"].append(springs)
         rate = self.scene.rate / self.frame.time
         if rate:
-            out["sources"] = [lambda points, q: rate * q * points.dx]
+            out["sources"] = [lambda points, q: _constant(points, rate) * q * points.dx]
         return out
 
     def region(self, condition: Condition) -> tuple:
@@ -258,7 +259,7 @@ class _Builder:
 
             def springs(points, u):
                 U = points.displacement + points.value(u)
-                return stiffness / 2 * ufl.inner(U, U) * points.dx
+                return _constant(points, stiffness / 2) * ufl.inner(U, U) * points.dx
 
             return mpm.OnSide(side, springs, region=region)
         outer = 0.0 if scene.level is None or c.kind == "seepage" else self.head
@@ -323,6 +324,11 @@ class _Builder:
         along[:, scene.dim - 1] = vertical
         axes = [*frame.axes, 2][:3]
         return frame.stress * along[:, axes][:, :, None] * np.eye(3)
+
+
+def _constant(points, value: float) -> fem.Constant:
+    """Return a number of a user-defined term, with which the term is not compiled anew for each scene."""
+    return fem.Constant(points.grid.mesh, value)
 
 
 @dataclass
