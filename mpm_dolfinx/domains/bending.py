@@ -11,9 +11,6 @@ with the position t_a in [0, 1] in the cell.  This field is exact for quadratic 
 and continuous.  D_a is a second difference along the cell edge that ends at node i.  Each end of the edge has one; the
 smaller one counts, or zero if their signs differ.  If only one end has a second difference, this one counts.  With
 cells of several sizes D_a is edge^2 times the divided difference.  Physical kinks, as between materials, are kept.
-
-D_a is zero along edges that end at a cell with yielded soil.  Its gradients jump, so second differences are no
-curvature there.  The correction would add volume to it: 5 % to a column of clay that runs out.
 """
 
 from __future__ import annotations
@@ -26,12 +23,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 
 def followed(
-    grid: Grid,
-    cells: NDArray[np.int32],
-    x: NDArray[np.float64],
-    u: NDArray[np.float64],
-    filled: NDArray[np.bool_],
-    kinks: NDArray[np.bool_] | None = None,
+    grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the Q1 displacement of corners and its quadratic correction (2, m, d), m.
 
@@ -43,14 +35,12 @@ def followed(
         Nodal displacements.
     filled : (cells,)
         Which local cells contain material.  Nodes beyond an empty cell may belong to another body.
-    kinks : (nodes,)
-        Nodes of cells with yielded soil, if any.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
     slot[used] = np.arange(len(used))
     field = grid.over_edges(grid.monomials @ _at(u, grid.cell_nodes[used]), used)
-    bends = _second_differences(grid, used, u, filled, kinks)
+    bends = _second_differences(grid, used, u, filled)
     out = np.empty((2, *x.shape))
     # corners are the last axis: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
@@ -86,11 +76,7 @@ def _polynomial(
 
 
 def _second_differences(
-    grid: Grid,
-    cells: NDArray[np.int32],
-    u: NDArray[np.float64],
-    filled: NDArray[np.bool_],
-    kinks: NDArray[np.bool_] | None,
+    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
     """Return the second differences along the edges of owned cells, m, for each axis.
 
@@ -119,8 +105,6 @@ def _second_differences(
         first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
         bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
-        if kinks is not None:
-            bend[:, (kinks[nodes[:, low]] | kinks[nodes[:, high]]).T] = 0.0
         across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # equal at both ends
         bend = (across[:, low] + across[:, high]) @ bend
         if not grid.even:  # for offsets in m

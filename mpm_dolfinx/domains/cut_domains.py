@@ -221,16 +221,13 @@ class CutDomains(Keyed):
         travel, cells, x = self._followed
         return travel.back(self.grid.at(cells, x, u))
 
-    def followed(
-        self, u: NDArray[np.float64], filled: NDArray[np.bool_], kinks: NDArray[np.bool_] | None = None
-    ) -> Iterator[NDArray[np.float64]]:
+    def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
         """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction there, m.
 
-        filled (cells,): which local cells contain material; kinks (nodes,): nodes of cells with yielded soil.
+        filled (cells,): which local cells contain material.
         """
         travel, cells, x = self._followed
-        fields = followed(self.grid, cells, x, u, filled, kinks)
-        return (travel.back(v).reshape(self.points.corners.shape) for v in fields)
+        return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
-from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -127,7 +126,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                followed = cut.followed(nodal, on_grid.active.contains, self._kinks(state.points, cut))
+                followed = cut.followed(nodal, on_grid.active.contains)
                 points, keeps, folded = self._shaped(state, loads, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
@@ -169,13 +168,6 @@ class Motion:
                 kept["pieces"] = replace(new.pieces, of_cell=carried.of_cell, start=carried.start)
             new = replace(new, stay=replace(stay, keeps=keeps), **kept)
         return new, folded
-
-    def _kinks(self, points: MaterialPoints, cut: CutDomains) -> NDArray[np.bool_] | None:
-        """Return the nodes (nodes,) of cells with yielded soil; None if no law has a history."""
-        if not self._materials.evolves:
-            return None
-        yields = cut.to_cells(self._materials.evolved(points)) & (cut.pieces_to_cells(cut.pieces.fraction) > NEAR)
-        return self._momentum.active_nodes(cut.cells[yields])  # rounding alone puts no domain into a cell
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t (s), up to a constant.
