@@ -230,6 +230,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: block(n, inertia=True),
         lambda n: block(n, inertia=True, conditions=[mpm.Quiet("right")]),
     ),
+    "tied sides": (
+        lambda n: block(n, inertia=True),
+        lambda n: block(n, inertia=True, conditions=[mpm.Tied("left", "right")]),
+    ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
     "damping of yielded soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),

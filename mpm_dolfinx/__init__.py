@@ -32,6 +32,7 @@ from mpm_dolfinx.conditions.conditions import (
     RigidPlate,
     Source,
     Through,
+    Tied,
     Traction,
 )
 from mpm_dolfinx.conditions.record import Record
@@ -140,6 +141,7 @@ __all__ = [
     "State",
     "Tangent",
     "Through",
+    "Tied",
     "Tool",
     "Traction",
     "VanGenuchten",

@@ -100,6 +100,7 @@ BENCHMARK = {
     "free tool that touches nothing": {"tools"},
     "free disc that rotates and touches nothing": {"tools"},
     "quiet side": {"quiet sides"},
+    "tied sides": {"tied sides"},
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},
     "contact of groups that are apart": {"contacts"},

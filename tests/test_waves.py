@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Waves leave through quiet sides, which keep their tractions at rest; bases move as prescribed."""
 
+import wave
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,37 @@ def test_a_wave_leaves_through_a_quiet_base(axis, c, scene):
         fastest = max(fastest, speed(s))
     assert fastest == pytest.approx(1e3 / RHO / c, rel=0.01) and speed(s) < 1e-3 * fastest
     assert s.points.displacement[:, axis] == pytest.approx(-1e3 / RHO / c * length / 2, rel=0.01)
+
+
+def test_a_sudden_load_runs_to_a_rigid_base_and_back():
+    """Exact: a triangle in time on top; on the base 0 until L / c, then twice the load until 3 L / c, c dt = h."""
+    n, q = 40, 1e3
+    s = column(n, [mpm.Traction("top", (0, -q)), mpm.Displacement("bottom", (0, 0), "y")])
+    top = mpm.probes(s.bodies, [[HEIGHT / n / 2, HEIGHT + (1 + OFF) * HEIGHT / n]])
+    result = s.run(4 * HEIGHT / C_P, HEIGHT / n / C_P, probes=top, progress=False)
+    t, most = result.t * C_P / HEIGHT, 2 * q * HEIGHT / (SOIL.bulk + 4 / 3 * SOIL.shear)
+    assert -result.displacement[:, 0, 1] == pytest.approx(most * np.minimum(t, 4 - t) / 2, abs=0.02 * most)
+    stress, far = result.reactions.array[0, :, 1] / (q * HEIGHT / n), np.abs(t - 2) > 1
+    away = (np.abs(np.abs(t - 2) - 1) > 0.3) & (t > 0.3)
+    assert stress[away] == pytest.approx(2.0 * ~far[away], abs=0.02 * 2)
+
+
+@pytest.mark.slow
+def test_saturated_columns_converge_under_loads_that_swing_or_come_at_once():
+    """The exact u-p solutions of the demo `wave`, at (1, 0.1) and for hard water and grains, with second order."""
+    c2 = (wave.MODULUS + 1 / wave.STORED) / wave.MIXED
+    w = np.sqrt(0.1 * c2) / wave.LENGTH
+    k = wave.GRAVITY * wave.WATER / wave.MIXED * w * wave.LENGTH**2 / c2
+    off = []
+    for n, steps in ((20, 25), (40, 50)):
+        u, p, depth = wave.swinging(n, steps, 3, w, k)
+        exact_u, exact_p = wave.harmonic(w, k, depth)
+        late = wave.hard(n, 4 * steps)
+        error = np.abs(late["u"] / late["exact"] - 1)[late["t"] > 0.02].max()
+        p_off = np.abs(p - exact_p) / np.abs(exact_p).max()
+        off.append([abs(u / exact_u - 1), p_off[0], p_off[1:].max(), error])
+    coarse, fine = np.array(off)
+    assert (fine < [0.01, 0.004, 0.002, 0.01]).all() and (coarse / fine > [3.6, 3.6, 3.0, 3.6]).all()
 
 
 def test_a_wave_that_comes_in_doubles_at_the_surface_and_leaves():

@@ -357,6 +357,30 @@ class Rain(Flux):
         return Through(self.ponding, self.at(t, side), True, self.driest)
 
 
+@dataclass(frozen=True, eq=False)
+class Tied(Condition):
+    """Two opposite sides of a box that move alike: ground of finite width that answers as if it went on uniformly.
+
+    Displacements at equal heights are equal, forces equal and opposite, at rest and with inertia.  A wave that leaves
+    the box on one side enters it on the other.  Water does not flow through the sides.
+
+    Parameters
+    ----------
+    side, other
+        Opposite sides of a box, as for `Traction`, with equal faces.
+
+    Raises
+    ------
+    ValueError
+        From the scene: the sides are not opposite, or have other faces.
+    """
+
+    side: str
+    other: str
+    region: ClassVar[None] = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {}
+
+
 RIGIDITY = 1e4
 """Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
 HOLD = 3e2

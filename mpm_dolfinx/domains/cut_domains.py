@@ -52,7 +52,7 @@ class Patches:
         self._faces = faces
         self.here = here
         self.at = at
-        self._xi = xi
+        self.xi = xi
         self.cell = cell
         self.x = x
         self._grid = grid
@@ -71,16 +71,16 @@ class Patches:
     @cached_property
     def X(self) -> NDArray[np.float64]:
         """Reference positions (n, d), m."""
-        X = self._faces.reference(self.here, self._xi)
-        return X if self._renewed is None else self._renewed.reference(X, self._xi)
+        X = self._faces.reference(self.here, self.xi)
+        return X if self._renewed is None else self._renewed.reference(X, self.xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the positions (n, d), m, at zero displacement."""
-        return interpolate(points.origin[self.at], self._xi)
+        return interpolate(points.origin[self.at], self.xi)
 
     def now(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the present positions (n, d), m."""
-        return interpolate(points.corners[self.at], self._xi)
+        return interpolate(points.corners[self.at], self.xi)
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""

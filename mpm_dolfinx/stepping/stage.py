@@ -26,6 +26,7 @@ from mpm_dolfinx.conditions.conditions import (
     Rain,
     RigidPlate,
     Source,
+    Tied,
     Traction,
 )
 from mpm_dolfinx.conditions.names import named
@@ -33,6 +34,7 @@ from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.ties import Ties
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides
@@ -46,7 +48,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
 from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
-Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Rain | Tool | Contact
+Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Tied | Drained | Inflow | Rain | Tool | Contact
 """Conditions on the bodies."""
 KINDS: tuple[type[Acting], ...] = (
     Tractions,
@@ -54,6 +56,7 @@ KINDS: tuple[type[Acting], ...] = (
     Plates,
     GivenDisplacements,
     QuietSides,
+    Ties,
     ToolsOfStage,
     ContactsOfStage,
 )

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: MIT
+"""Tied sides: two opposite sides of the ground move alike, as if it went on beyond them.
+
+A penalty on the difference of the displacements of places at equal height, k/2 int |u_one - u_other|^2 dA.  It is
+measured from the seeded positions, so its error does not accumulate.  Forces on both sides are equal and opposite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from petsc4py import PETSc
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.faces import Surface, interpolate
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
+from mpm_dolfinx.conditions.conditions import HOLD, Tied, holding
+from mpm_dolfinx.conditions.sides import gathered
+from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix
+from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.grid.grid import Grid
+
+
+class Tie:
+    """Two opposite sides, and the faces that belong together.
+
+    partner (m,): face of the other side for each face of one side; way (m, d): from one to the other, m; axis: normal.
+    """
+
+    def __init__(self, tied: Tied, one: Surface, other: Surface):
+        self.one, self.other = one, other
+        self.axis = int(one.face[0]) // 2
+        at, there = one.places().mean(axis=1), other.places().mean(axis=1)
+        along = np.arange(at.shape[1]) != self.axis
+        off, self.partner = cKDTree(there[:, along]).query(at[:, along])
+        alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
+        small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
+        if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
+            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a box with equal faces")
+        self.way = there[self.partner] - at
+
+
+class Ties(Acting):
+    """The tied sides of a stage.
+
+    Parameters
+    ----------
+    setting, ties
+        The stage, and its tied sides by name.
+
+    Raises
+    ------
+    ValueError
+        The sides are not opposite, or have other faces.
+    """
+
+    conditions, title = (Tied,), "tied sides"
+
+    def __init__(self, setting: Setting, ties: Mapping[str, Tied]):
+        self._grid, self._materials = setting.grid, setting.materials
+        of = setting.sides.of
+        self._ties = [Tie(tied, of(tied), of(Tied(tied.other, tied.side))) for tied in ties.values()]
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """Faces of one side of each tie."""
+        return [tie.one for tie in self._ties]
+
+    def placed(self, place: Place) -> Loads:
+        """Return the penalty in a substep."""
+        grid, points = self._grid, place.points
+        d, rows = grid.dim, []
+        modulus = self._materials.table(points, holding)
+        for tie in self._ties:
+            p = place.cut.surface(tie.one)
+            here, at = points.find(tie.other.id)
+            moved = np.zeros((len(tie.other), 2**d, d))
+            moved[here] = points.corners[at] - points.origin[at]
+            moved = grid.comm.allreduce(moved)
+            across = p.xi * np.where(np.arange(d) == tie.axis, -1.0, 1.0)
+            gap = p.now(points) - p.origin(points) - interpolate(moved[tie.partner[p.here]], across)
+            y = p.x + tie.way[p.here]
+            inside = y - NEAR * np.sign(tie.way[p.here, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
+            index = np.floor(grid.in_cells(inside)).astype(np.int64)
+            other = np.ravel_multi_index(tuple(index.T), tuple(grid.shape)) + p.cell // grid.cells * grid.cells
+            area = np.linalg.norm(p.area(points), axis=1)
+            stiffness = HOLD * modulus[p.at] * area / grid.sizes_at(p.x).min(axis=-1)
+            values = np.concatenate([np.stack([stiffness, other], axis=1), gap, y], axis=1)
+            rows.append((p.cell, p.x, values))
+        cell, x, values = gathered(grid, rows, 2 + 2 * d)
+        stiffness, other, gap, y = np.split(values, [1, 2, 2 + d], axis=1)
+        return TieLoads(grid, cell, x, other[:, 0].astype(np.int64), y, stiffness[:, 0], gap)
+
+
+class TieLoads(Loads):
+    """Tied sides in a substep.
+
+    Parameters
+    ----------
+    cell, x : (m,), (m, d), m
+        Local cells and positions on one side.
+    other, y : (m,), (m, d), m
+        Lexicographic cells and positions on the other side.
+    stiffness : (m,), N/m
+        Penalties.
+    gap : (m, d), m
+        Differences of displacements at the start of the step.
+    """
+
+    couples = True
+
+    def __init__(self, grid: Grid, cell, x, other, y, stiffness: NDArray[np.float64], gap: NDArray[np.float64]):
+        self._grid = grid
+        self._cell, self._other = cell, other
+        index = np.stack(np.unravel_index(other % grid.cells, tuple(grid.shape)), axis=1)
+        beyond = np.prod(0.5 + (grid.in_cells(y) - index - 0.5)[:, None] * grid.signs, axis=2)
+        self._values = np.concatenate([grid.shape_values(cell, x), -beyond], axis=1)
+        self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
+
+    def _B(self, unknowns: Unknowns) -> PETSc.Mat:
+        """Return the matrix that gives differences of displacements (m d,), m, from the unknowns."""
+        return at_nodes(self._grid, unknowns, self._cell, self._values, self._other)
+
+    def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
+        """Add the resistance at u."""
+        B = self._B(at.unknowns)
+        w = B.createVecLeft()
+        B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
+        w.array_w[:] = self._stiffness * (w.array_r + self._gap)
+        B = B if on is at.unknowns else self._B(on)
+        B.multTransposeAdd(w, residual, residual)
+
+    def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
+        """Return a zero matrix with the pattern of `coupling`."""
+        out = self._coupling(unknowns)
+        out.zeroEntries()
+        return out
+
+    def coupling(self, at: At) -> PETSc.Mat:
+        """Return the derivative of the resistance."""
+        return self._coupling(at.unknowns)
+
+    def _coupling(self, unknowns: Unknowns) -> PETSc.Mat:
+        B = self._B(unknowns)
+        k = scipy.sparse.diags(self._stiffness, format="csr")
+        return petsc_matrix(k, B.getLocalSize()[0], self._grid.comm, own=True).PtAP(B)
