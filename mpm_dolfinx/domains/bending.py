@@ -86,7 +86,7 @@ def _second_differences(
     bits = corner_bits(grid.dim)
     out = []
     order = np.lexsort(grid.signs.T)  # of the nodes, to match `bits`
-    nodes, beside = grid.cell_nodes[cells], grid.beside(cells)
+    nodes, beside = grid.cell_nodes[cells], grid.neighbours(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
         first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])

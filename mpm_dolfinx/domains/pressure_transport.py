@@ -131,7 +131,7 @@ class Reconstruction:
     def __init__(self, grid: Grid):
         self.grid = grid
         self._slope = fem.Function(grid.cellwise((grid.dim,)))
-        self._neighbour = grid.beside(np.arange(grid.num_owned))
+        self._neighbour = grid.neighbours(np.arange(grid.num_owned))
 
     def __call__(
         self, seen: CellPressures, origin: NDArray[np.float64]

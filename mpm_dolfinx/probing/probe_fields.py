@@ -244,7 +244,7 @@ class _Around:
         face = order[np.arange(len(row)) + np.repeat(first - np.cumsum(last - first) + last - first, last - first)]
         flows = (sides.shape > 0)[face] & ~(sides.seeps[face] & (self._p[probe, place][row] <= sides.pressure[face]))
         row, face = row[flows], face[flows]
-        offset, axis = self._centroid[probe, place][row] + sides.reach[face], np.abs(sides.normal[face]).argmax(axis=1)
+        offset, axis = self._centroid[probe, place][row] + sides.offset[face], np.abs(sides.normal[face]).argmax(axis=1)
         looks = 2 * axis + (sides.normal[face, axis] > 0)
         side, group = np.unique(2 * d * row + looks, return_inverse=True)
         area = np.linalg.norm(sides.area[face], axis=1)

@@ -104,7 +104,7 @@ class Motion:
             The bodies on the grid, and their integration points at the start of the step.
         loads
             Loads at the end of the step.
-        came : (n,), m^d
+        net_inflow : (n,), m^d
             Net fluid inflow into the filled owned cells in the step; None leaves the points' volume defect unchanged.
         report
             Report of the step, for the exception if a point leaves the grid.
