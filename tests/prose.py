@@ -4,9 +4,9 @@
     python -m tests.prose --show PART               # the long and the vague sentences of a part
     python -m tests.prose --draw 300 --seed 1       # sentences drawn at random, with their places, for a reader
 
-Text is that of docstrings and of pages without code, tables' rules, comments and formulas.  Code in a sentence counts
-as one word.  *Vague* words are those behind which a noun is missing or far away.  A sentence ends at a full stop, a
-colon, or at the end of a paragraph, of an item or of a cell of a table.
+The text comes from docstrings, and from pages without code, tables' rules, comments and formulas.  Code in a sentence
+counts as one word.  The noun of a *vague* word is missing or far away.  A sentence ends at a full stop or a colon, and
+with its paragraph, item or cell of a table.
 """
 
 import ast

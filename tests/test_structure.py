@@ -78,7 +78,7 @@ CHANGES = {
     ("Table", "columns"): "of a file that is begun with its first row",
     ("Checkpoint", "_written"): "when the file was written",
 }
-"""All that objects change after they are made, and why it is no part of the state; what else changes is hidden."""
+"""All changes of objects after their construction, and why these are no part of the state; others are hidden state."""
 
 
 def test_nothing_else_is_set_outside_of_init():

@@ -237,9 +237,9 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
     """
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
-        way = X[:, 1 << k] - X[:, 0]
+        edge = X[:, 1 << k] - X[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):  # edges across an axis have no limit along it
-            ends = np.where(np.abs(way) > rounding(X), (region[:, None] - X[:, 0]) / way, [[[-np.inf]], [[np.inf]]])
+            ends = np.where(np.abs(edge) > rounding(X), (region[:, None] - X[:, 0]) / edge, [[[-np.inf]], [[np.inf]]])
         low[:, k] = np.maximum(0.0, ends.min(axis=0).max(axis=1))
         high[:, k] = np.minimum(1.0, ends.max(axis=0).min(axis=1))
     return low, np.maximum(low, high)
@@ -272,13 +272,13 @@ def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArr
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
     cover = Cover(*(np.concatenate([getattr(c, f.name) for c in on]) for f in fields(Cover)))
-    turned = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
-    row, low, high = uncovered(len(own.row), *(x[~turned] for x in (cover.face, cover.low, cover.high, cover.slack)))
-    whole = ~np.isin(row, cover.face[turned])
+    flipped = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
+    row, low, high = uncovered(len(own.row), *(x[~flipped] for x in (cover.face, cover.low, cover.high, cover.slack)))
+    whole = ~np.isin(row, cover.face[flipped])
     quads = np.where(BITS, high[whole, None], low[whole, None])
-    if not turned.any():
+    if not flipped.any():
         return row, quads
-    split, triangles = uncovered_triangles(own, cover, np.unique(cover.face[turned]))
+    split, triangles = uncovered_triangles(own, cover, np.unique(cover.face[flipped]))
     return np.concatenate([row[whole], split]), np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
 
 

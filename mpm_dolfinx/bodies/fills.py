@@ -112,11 +112,11 @@ def put(
         together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
         if together and not touching:
             warn_near(grid, f"bodies {other} and {fill}", gap, x + grid.base)
-    mine = corners[new.id - _start(bodies, fill)]
-    if (mine == new.corners).all():
+    own = corners[new.id - _start(bodies, fill)]
+    if (own == new.corners).all():
         return new
-    volume = domain_volumes(mine, grid.axisymmetric)
-    return replace(new, corners=mine, x=centroids(mine), volume0=volume, origin=mine, reference=mine)
+    volume = domain_volumes(own, grid.axisymmetric)
+    return replace(new, corners=own, x=centroids(own), volume0=volume, origin=own, reference=own)
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:

@@ -86,7 +86,7 @@ def _second_differences(
     bits = corner_bits(grid.dim)
     out = []
     order = np.lexsort(grid.signs.T)  # of the nodes, to match `bits`
-    nodes, beside = grid.cell_nodes[cells], grid.neighbours(cells)
+    nodes, neighbours = grid.cell_nodes[cells], grid.neighbours(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
         first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])
@@ -94,7 +94,7 @@ def _second_differences(
         ends = []
         known = []
         for k, (end, value) in enumerate(((low, first), (high, last))):
-            local = beside[:, a, k]
+            local = neighbours[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
             known.append(np.broadcast_to((local >= 0) & filled[local], (2 ** (d - 1), len(local))))
             if grid.even:

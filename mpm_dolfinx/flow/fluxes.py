@@ -101,9 +101,7 @@ class Conduction:
         across = kappa / ratio[at] * (pulled**2).sum(axis=1)
         return across if hoop is None else across * hoop[at]
 
-    def distance_ratio(
-        self, at: NDArray[np.int64], normal: NDArray[np.float64], offset: NDArray[np.float64]
-    ) -> NDArray | float:
+    def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
         """Return ratios (m,) of distances to faces, along normals (m, d): from centroids over from pressure positions.
 
         offset (m, d): vectors from the centroids to the faces, m.

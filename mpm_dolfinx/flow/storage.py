@@ -224,18 +224,18 @@ class Outflow:
 class Rates:
     """Outflow rates of the owned cells, m^d/s, or with `integrated` outflow volumes, m^d.
 
-    cells: outflow less sources of each; outward: outflow from the bodies less sources; turnover: sum of inflow and
+    cells: outflow less sources of each; net: outflow from the bodies less sources; turnover: sum of inflow and
     outflow; gain: absolute value of sources.
     """
 
     cells: NDArray[np.float64]
-    outward: NDArray[np.float64]
+    net: NDArray[np.float64]
     turnover: NDArray[np.float64]
     gain: NDArray[np.float64]
 
     def integrated(self, seconds: float) -> Rates:
         """Return the outflow volumes in a time, s."""
-        return Rates(*(seconds * values for values in (self.cells, self.outward, self.turnover, self.gain)))
+        return Rates(*(seconds * values for values in (self.cells, self.net, self.turnover, self.gain)))
 
 
 class StorageSystem:
@@ -603,8 +603,7 @@ class StorageProblem:
         r.array_w[:] = mass / density
         # bound of rounding errors: of volumes, and of fluxes that cancel
         round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
-        net = change + now.outward + before.outward
-        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), net
+        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.net + before.net
         return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
@@ -615,19 +614,17 @@ class StorageProblem:
             fluid = fluid._replace(force=self._inertial())
             force = self._local(fluid.force)
         if system.gravity is None:
-            cells = system.between(fluid.pi) + self._correction
+            cells = system.between(fluid.pi)
         else:
-            cells = (
-                self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
-                + self._correction
-            )
-        outward, gain = np.zeros((2, len(cells)))
+            cells = self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
+        cells = cells + self._correction
+        net, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):
             leaving = one.leaving(at, fluid)
-            outward, gain = outward + leaving.cells, gain + leaving.gain
+            net, gain = net + leaving.cells, gain + leaving.gain
             turnover = turnover + leaving.turnover
-        return Rates(cells + outward, outward, turnover, gain)
+        return Rates(cells + net, net, turnover, gain)
 
     def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values (n, d) of the active owned cells in an array (c, d) of the local ones."""

@@ -135,9 +135,9 @@ class SceneMaterials:
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
                 self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
-                mine = np.zeros((len(points), *value.shape[1:]))
-                mine[here] = value[rows]
-                seeded[name] = mine + seeded[name] if name in seeded else mine
+                filled = np.zeros((len(points), *value.shape[1:]))
+                filled[here] = value[rows]
+                seeded[name] = filled + seeded[name] if name in seeded else filled
         seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
@@ -285,7 +285,7 @@ class SceneMaterials:
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
-    def felt(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the part of the pore pressure in total stresses at the points (n,), Pa: alpha chi p."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
@@ -441,7 +441,7 @@ class SceneMaterials:
         """Return the points (n,) whose law has no history."""
         return np.array([not m.state for m in self.materials])[points.material]
 
-    def alike(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return rows (n, c) that are equal at points of the same elastic soil, whatever its initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
@@ -493,7 +493,7 @@ class SceneMaterials:
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
-        return self.effective_stress(points) - self.felt(points)[:, None, None] * np.eye(self.grid.stretches)
+        return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
@@ -509,13 +509,13 @@ class SceneMaterials:
             return points.data
         placed = self._placed(points)
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
-        bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
-        shown = [
+        invalid = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
+        messages = [
             f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]] + self.grid.base}"
-            for law, name, i in bad
+            for law, name, i in invalid
             if len(i)
         ]
-        if message := first(self.grid.comm, "".join(shown[:1])):
+        if message := first(self.grid.comm, "".join(messages[:1])):
             raise NotConverged(message)
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}
         for _, rows, name, values in new:

@@ -145,7 +145,7 @@ class MomentumForms:
         if self._of_suction is not None and "suction" in law.state:
             p = ufl.variable(self._retentions.at(pressure, points))
             values["suction"] = ufl.max_value(-p, 0.0)
-        seen = self.dilatation.seen(points, F) if locks else F
+        seen = self.dilatation.fbar(points, F) if locks else F
         if law.unknowns:
             self._local[number] = local = LocalUnknowns(law, points, seen, values)
             values, known = values | local.values, values | local.known
@@ -538,8 +538,8 @@ class MomentumProblem:
         counts = relative(parts.norms(size if first else np.maximum(size - rounding, 0.0)), scales)
         least = rounding * np.sqrt(parts.sizes)[parts.of] / self._tolerance
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            told = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
-        return counts, relative(told, np.ones(parts.count))
+            full = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
+        return counts, relative(full, np.ones(parts.count))
 
     def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
         """Return the forces (d,), N, of the walls by name at u; the residual must have been assembled there."""

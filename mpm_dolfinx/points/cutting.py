@@ -108,8 +108,8 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the signed volumes (k, n) of the simplices of domains with these vertices (v, d, n)."""
-    d, (*rest, middle) = v.shape[1], simplices(v.shape[1]).T
-    facets = np.stack([v[vertex] for vertex in rest], axis=-1)  # (k, d, n, d)
+    d, (*others, middle) = v.shape[1], simplices(v.shape[1]).T
+    facets = np.stack([v[vertex] for vertex in others], axis=-1)  # (k, d, n, d)
     s = np.moveaxis(facets, (3, 1, 0, 2), (0, 1, 2, 3)).reshape(d, d, -1)
     height = s[0] - np.moveaxis(v[middle], 1, 0).reshape(d, -1)
     volume = (_area_vectors(s) * height).sum(axis=0) / d
@@ -326,7 +326,7 @@ class _Slots:
         place = index.astype(np.int64) - self.low[:, owner]
         return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
 
-    def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    def sums_beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """Return the sums of the slots' values over the cells further along an axis in the same column."""
         out = np.zeros(self.size)
         for steps in range(1, int(self._span[axis].max(initial=1))):
@@ -372,12 +372,12 @@ def _sum(
 
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
     shadow = total(area[0])
-    beyond = slots.beyond(shadow, 0)
+    beyond = slots.sums_beyond(shadow, 0)
     volume = total(area[0] * sums[0] / d) + beyond
     moments = [total(products / 2 * (sums[0] ** 2 + pair(0, 0))) + beyond / 2]
     for a in range(1, d):
         within = total(products * (sums[0] * sums[a] + pair(0, a)))
-        moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
+        moments.append(within + slots.sums_beyond(total(area[0] * sums[a] / d), 0))
     pairs = [(1, 2), (0, 2), (0, 1)] if d == 3 else [(0, 1)] * second
     pairs += [(a, a) for a in range(d)] * second
     uneven = _products(pairs, x, sums, area[0], pair, total, slots)
@@ -392,7 +392,7 @@ def _sum(
         squares = total(area[0] / 12 * (x0 + x1) * (x0**2 + x1**2)) + beyond / 3
         products = area[0] / 24 * (x0**2 * (3 * x[0, 1] + x[1, 1]) + x1**2 * (x[0, 1] + 3 * x[1, 1]))
         products = total(products + area[0] / 12 * x0 * x1 * sums[1])
-        products += slots.beyond(total(area[0] * sums[1] / 2), 0) / 2
+        products += slots.sums_beyond(total(area[0] * sums[1] / 2), 0) / 2
         r = s[:, 0].mean(axis=0)
         if grid.even:
             area[1] *= grid.low[0] + grid.h[0] * r  # sections across the axis are rings too
@@ -401,7 +401,7 @@ def _sum(
     faces = np.empty((len(kept), d, 2))
     for a in range(d):
         shadow = total(area[a]) if a else shadow
-        beyond = slots.beyond(shadow, a)
+        beyond = slots.sums_beyond(shadow, a)
         lower, upper = (total(area[a], chosen) for chosen in ends[a])
         # the section of the body just above the lower and just below the upper face
         faces[:, a] = np.stack([beyond + shadow - lower, beyond + upper], axis=1)[kept]
@@ -512,7 +512,7 @@ def _products(
     out = []
     for a, b in pairs:
         rest = [axis for axis in (a, b) if axis]
-        out.append((total(mean(0, a, b)) + slots.beyond(total(mean(*rest)), 0)) / (3 - len(rest)))
+        out.append((total(mean(0, a, b)) + slots.sums_beyond(total(mean(*rest)), 0)) / (3 - len(rest)))
     return out
 
 

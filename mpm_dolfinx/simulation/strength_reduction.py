@@ -89,7 +89,8 @@ def factor_of_safety(
     """Return the factor of safety by strength reduction: bodies slide when their strength is divided by more than it.
 
     The simulation is unchanged. A scene that cannot stand needs no run: trials start from an elastic step of dt. The
-    call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided.
+    call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided. The factor
+    of a thin weak layer at the surface depends on `rtol`: where it slides alone, its share of the load decides.
 
     Parameters
     ----------

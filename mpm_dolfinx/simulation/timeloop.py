@@ -311,9 +311,9 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool, events: Events) -> bool:
+def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
     """Take one step towards the time target, s; return whether an event has ended the run."""
-    step, new = _advance(simulation, rule, target, aloud)
+    step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
     if found is None:
         simulation.state = new
@@ -334,10 +334,10 @@ def _accepted(
     return replace(new, result=start.result.after(report), control=grown)
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> tuple[Step, State]:
+def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
     """Return a step towards the time target, s, and its end state; it is cut until it converges and is accurate.
 
-    aloud: warn of the first cut of a run.
+    verbose: warn of the first cut of a run.
     """
     comm = simulation.scene.grid.comm
     wanted = None
@@ -355,8 +355,8 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
             left = _has_left(failed, rule, taken, state)
             if not left and cut.small >= rule.least(wanted, state.t):
                 _note(simulation, counted, cut)
-                loud = aloud and not result.cuts
-                level, more = (WARNING, "; others: messages of level INFO") if loud else (INFO, "")
+                verbose_step = verbose and not result.cuts
+                level, more = (WARNING, "; others: messages of level INFO") if verbose_step else (INFO, "")
                 log(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more, level=level)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:

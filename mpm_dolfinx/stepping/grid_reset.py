@@ -408,13 +408,13 @@ class OnGrid(Keyed):
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return np.flatnonzero(self.contents.total(self.cut.cells, moves) == 0)
 
-    def serves(self, points: MaterialPoints) -> NDArray[np.bool_]:
+    def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return whether each point (n,) stays in its cut: its part hardly moves; groups are tested together."""
-        all_of_them = self.cut.serves(points, np.zeros(len(points), dtype=np.int64), 1)[0]
+        all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
         if all_of_them or self.cut.grid.copies > 1:
             return np.full(len(points), all_of_them)
         part, count = self.parts
-        return self.cut.serves(points, part, count)[part]
+        return self.cut.valid(points, part, count)[part]
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:

@@ -306,8 +306,8 @@ class BiotFEM:
         F, F_n = (ufl.variable(self._deformation(f)) for f in (u, u_n))
         J, J_n = ufl.det(F), ufl.det(F_n)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
-        felt = self._pores.of("bishop", p) * p
-        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * felt * ufl.diff(J, F)
+        effective = self._pores.of("bishop", p) * p
+        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * effective * ufl.diff(J, F)
         residual, flux = around * ufl.inner(P, self._grad(v)) * dx, None
         points = SimpleNamespace(  # the configuration at the start of the step
             dx=PointMeasure(self.grid.mesh, around * J_n, "everywhere", degree),
@@ -318,14 +318,14 @@ class BiotFEM:
             position=self._places + u_n,
             **parameters,
         )
-        seen = {"points": points, "t": t}
+        arguments = {"points": points, "t": t}
         for term in terms:
             more = {"u": u - u_n, "v": v, "dt": since, "velocity": (u - u_n - past) / dt}
-            residual += 1 / scale * term_of(term, space.w, test, **seen, **more)[0]
-        pull = None if gravity is None else self._constant(np.zeros(self.grid.dim))
+            residual += 1 / scale * term_of(term, space.w, test, **arguments, **more)[0]
+        gravity_constant = None if gravity is None else self._constant(np.zeros(self.grid.dim))
         if self.fluid:
-            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets, pull)
-            flux -= sum(dt * form_of("sources", source, **seen, q=q, p=scale * p) for source in sources)
+            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets, gravity_constant)
+            flux -= sum(dt * form_of("sources", source, **arguments, q=q, p=scale * p) for source in sources)
             residual += around * content * dx + flux
             flux = _compat.compiled(flux)
         for plate, area in self._plates:
@@ -342,11 +342,11 @@ class BiotFEM:
             else:
                 dead.append(self._on(load, ufl.inner(value, v) / scale))
         if gravity is not None:
-            given.append((partial(self._acceleration, gravity), pull))
+            given.append((partial(self._acceleration, gravity), gravity_constant))
             solid = self._constant((1 - law.porosity) * law.grain_density)
-            dead.append(around * solid * ufl.inner(pull, v) / scale * dx)
+            dead.append(around * solid * ufl.inner(gravity_constant, v) / scale * dx)
             if self.fluid:
-                weight = self._constant(self.fluid.density) * self._held(J, p) * pull
+                weight = self._constant(self.fluid.density) * self._held(J, p) * gravity_constant
                 residual -= around * ufl.inner(weight, v) / scale * dx
         tangent = ufl.derivative(residual, space.w, ufl.TrialFunction(space.W))
         load = _compat.compiled(sum(dead)) if dead else None
@@ -401,16 +401,16 @@ class BiotFEM:
             x = self._places + u
             k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
         kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
-        back = self._in_plane(ufl.inv(F).T)
+        inverse = self._in_plane(ufl.inv(F).T)
         weight = None if pull is None else self._constant(self.fluid.density / self.scale) * pull
         if outlets is not None:
-            return content, self._two_point(kappa, F, back, p, q, outlets, weight)
+            return content, self._two_point(kappa, F, inverse, p, q, outlets, weight)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
-        drives = back * ufl.grad(mass_potential_form(p, compliance))
+        gradient = inverse * ufl.grad(mass_potential_form(p, compliance))
         if weight is not None:
-            drives -= ufl.exp(compliance * p) * weight
+            gradient -= ufl.exp(compliance * p) * weight
         kappa *= self._pores.of("relative_permeability", self._seen)
-        return content, self._around * kappa * J * ufl.inner(drives, back * ufl.grad(q)) * dx
+        return content, self._around * kappa * J * ufl.inner(gradient, inverse * ufl.grad(q)) * dx
 
     @property
     def _seen(self):
