@@ -586,5 +586,5 @@ def test_a_polygon_warns_of_small_domains_for_a_given_size_only(warned):
     grid, wedge = mpm.Grid([0, 0], [20, 12], [40, 24]), [[0, 0], [20, 0], [0, 8]]
     mpm.polygon(grid, wedge, "side")
     assert not warned()
-    mpm.polygon(grid, wedge, "side", size=0.24)
+    mpm.polygon(grid, wedge, "side", size=0.25)
     assert "smaller than 0.2 of the grid's resolution" in warned()[0]

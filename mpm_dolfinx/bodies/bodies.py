@@ -266,9 +266,9 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
         # the copies of the grid have equal owners
-        here = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
-        rows.append(part.start + here)
-        corners.append(of_part[here])
+        own = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
+        rows.append(part.start + own)
+        corners.append(of_part[own])
     return np.concatenate(rows), np.concatenate(corners)
 
 

@@ -140,17 +140,17 @@ def surface(
     present
         Which bodies are present, by default all.
     """
-    there = [present is None or bool(present[i]) for i in range(len(bodies))]
+    shown = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
     if name is not None and (not isinstance(name, str) or name not in known):
         raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
     box = limits(region, dim)
-    around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
+    around = [Faces.around(body) if here and sum(shown) > 1 else None for body, here in zip(bodies, shown, strict=True)]
     none = np.empty(0, np.int64)
     start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):
         on = body.outer() if name is None else body.named(name)
-        row, face = _in_region(body, *on, box) if there[i] else (none, none)
+        row, face = _in_region(body, *on, box) if shown[i] else (none, none)
         others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
         part, t = _free(Faces.of(body, row, face), others)
         part, xi = _limited(body, row, face, part, t, box)

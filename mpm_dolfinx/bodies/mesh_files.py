@@ -122,7 +122,7 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: st
         kind, rows = _first_order(dim, block)
         _check_nodes(rows, len(x))
         if kind != block.type and kind in KINDS[dim]:
-            curved, off = curved + len(rows), max(off, _beside(x, rows, kind))
+            curved, off = curved + len(rows), max(off, _edge_node_distance(x, rows, kind))
         blocks.append((kind, rows[:, : _vertices(dim, kind)]))
     if curved:
         _warn_curved(grid, name, curved, off)
@@ -181,7 +181,7 @@ def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
         raise ValueError(f"mesh: a cell has the node {worst}, must be one of {count}, from 0 on")
 
 
-def _beside(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
+def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
     """Return the largest distance, m, of edge nodes of second-order cells from the midpoints of the edges.
 
     Edge nodes follow the vertices, in an order that depends on the format.
@@ -313,7 +313,7 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
         what = f"must have {vertices} or {orders}: of first or second order"
         raise ValueError(f"mesh: its cells have {dofs.shape[1]} nodes, {what}")
     if dofs.shape[1] != vertices:
-        off = _beside(mesh.geometry.x, _as_meshio(dofs, kind), kind)
+        off = _edge_node_distance(mesh.geometry.x, _as_meshio(dofs, kind), kind)
         count, off = mesh.comm.allreduce(owned), mesh.comm.allreduce(off, op=MPI.MAX)
         _warn_curved(grid, "mesh", count, off)
         dofs = dofs[:, :vertices]

@@ -112,14 +112,14 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(BITS, t[:, None], 1 - t[:, None]).prod(axis=2)
 
 
-def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) with boxes within a distance `reach`."""
+def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
+    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) with boxes within a distance `distance`."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
     size = [np.ptp(c, axis=1) for c in (a, b)]
     edge = np.maximum(size[0].max(axis=0), size[1].max(axis=0))
-    slack = reach + edge.max() / 100
+    slack = distance + edge.max() / 100
     i, j = (
         np.flatnonzero(((c.max(axis=1) >= low - slack) & (c.min(axis=1) <= high + slack)).all(axis=1)) for c in (a, b)
     )
@@ -404,18 +404,18 @@ def meeting(
     and gap 0; distant ones a gap of inf.
     """
     i, j = near(a[0], b[0])
-    apart, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
-    if (apart <= slack).any():
-        k = int(np.argmin(apart + slack))
-        depth, gap = max(0.0, -apart[k]) if apart[k] < -slack[k] else 0.0, 0.0
+    separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
+    if (separations <= slack).any():
+        k = int(np.argmin(separations + slack))
+        depth, gap = max(0.0, -separations[k]) if separations[k] < -slack[k] else 0.0, 0.0
     else:
         one, other = in_cells(a[0]), in_cells(b[0])
         i, j = near(one, other, 1.0)
-        apart = separation(one[i], other[j])
+        separations = separation(one[i], other[j])
         if not len(i):
             return 0.0, np.inf, np.zeros(one.shape[-1])
-        k = int(np.argmin(apart))
-        depth, gap = 0.0, float(apart[k])
+        k = int(np.argmin(separations))
+        depth, gap = 0.0, float(separations[k])
     one, other = a[0][i[k]], b[0][j[k]]
     x = (np.maximum(one.min(axis=0), other.min(axis=0)) + np.minimum(one.max(axis=0), other.max(axis=0))) / 2
     return depth, gap, x
@@ -423,15 +423,15 @@ def meeting(
 
 def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> None:
     """Raise an error for seeded bodies that overlap; warn about separate bodies that will stick."""
-    there = [i for i in range(len(bodies)) if present[i]]
-    found = {i: solids(bodies[i]) for i in there} if len(there) > 1 else {}
+    indices = [i for i in range(len(bodies)) if present[i]]
+    found = {i: solids(bodies[i]) for i in indices} if len(indices) > 1 else {}
     first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
-    for i, j in combinations(there, 2):
+    for i, j in combinations(indices, 2):
         depth, gap, x = meeting(found[i], found[j], lambda x: grid.in_cells(x - grid.base))
         if depth:
             raise ValueError(f"bodies {i} and {j}: overlap at {x} by {depth:.3g} m, must not")
         together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # contact groups share no node
-        if together and 0 < gap < 1 and not any(_inside(x, found[k][0]) for k in there if k not in (i, j)):
+        if together and 0 < gap < 1 and not any(_inside(x, found[k][0]) for k in indices if k not in (i, j)):
             warn_near(grid, f"bodies {i} and {j}", gap, x)
 
 

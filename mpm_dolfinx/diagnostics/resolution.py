@@ -56,7 +56,7 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
     return found, grid.base + grid.places(np.array(np.unravel_index(cell % grid.cells, grid.shape)), 0.5)
 
 
-LOST = 0.03
+LOSS = 0.03
 """Lost fraction of a soft material's deformation, in mixed cells, from which a warning is issued."""
 AGAIN = 2.0
 """Growth of that fraction from one warning to the next, as interfaces move to the middle of cells."""
@@ -65,7 +65,7 @@ FINE = 0.1
 
 
 def warn_smeared(
-    cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOST
+    cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOSS
 ) -> Callable[..., Any]:
     """Warn about the soft material that loses most deformation in cells shared with stiffer materials.
 

@@ -44,11 +44,11 @@ def followed(
     out = np.empty((2, *x.shape))
     # corners are the last axis: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
-        here, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
-        out[0, part] = _polynomial(field, y, here).T
+        slots, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
+        out[0, part] = _polynomial(field, y, slots).T
         h = grid.h[:, None] if grid.even else grid.sizes(cells[part]).T
         weights = 0.5 * ((y / h) ** 2 - 0.25)  # t (t - 1) / 2
-        out[1, part] = sum(weights[a] * _polynomial(bends[a], y, here, a) for a in range(grid.dim)).T
+        out[1, part] = sum(weights[a] * _polynomial(bends[a], y, slots, a) for a in range(grid.dim)).T
     return out
 
 

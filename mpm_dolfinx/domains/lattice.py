@@ -79,8 +79,8 @@ class Lattice:
         self._contacts = np.unique(np.take_along_axis(body.nodes(contacts[0]), contacts[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
-            here = (faces.id >= self._start) & (faces.id < self._stop)
-            corners = body.nodes(faces.id[here] - self._start), FACES[self._dim][faces.face[here]]
+            own = (faces.id >= self._start) & (faces.id < self._stop)
+            corners = body.nodes(faces.id[own] - self._start), FACES[self._dim][faces.face[own]]
             for axis in axes:
                 of_axes[axis].append(np.take_along_axis(*corners, axis=1).ravel())
         self._given = [np.unique(np.concatenate(numbers)) for numbers in of_axes]

@@ -81,8 +81,8 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
     ring = corners[:, RING] / grid.h
     edge = np.roll(ring, -1, axis=1) - ring
     parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
-    turned = parts.min(axis=0, initial=0.0) < -CRUMB * grid.cell_volume
-    return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | turned
+    inverted = parts.min(axis=0, initial=0.0) < -CRUMB * grid.cell_volume
+    return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | inverted
 
 
 class RefilledCells:
@@ -245,7 +245,7 @@ class RefilledCells:
         y = (bits[:, None] + bits[None]) / 2  # (4 domains, 4 corners, 2)
         of = np.repeat(cells, 4)
         local = np.tile(y, (len(cells), 1, 1))
-        return self._beside(of, local, *_no_faces(len(of)))
+        return self._partial(of, local, *_no_faces(len(of)))
 
     def partial(self) -> New:
         """Return the new domains of cells crossed by the surface."""
@@ -263,7 +263,7 @@ class RefilledCells:
         edge = np.linalg.norm(upper - lower, axis=1)
         total = sum_by(cells[at], edge, self.cells)  # of all new edges on the surface
         area[at, face] = edge / total[cells[at]] * whole[cells[at]]
-        return self._beside(cells, local, parent, area, ends)
+        return self._partial(cells, local, parent, area, ends)
 
     def _nearest(
         self,
@@ -297,12 +297,12 @@ class RefilledCells:
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (m, 2), m, of coordinates t (m,) on faces, from 0 at their start to 1."""
         face = self.faces.face[row]
-        turned = START[face] != FACES[2][face, 0]
-        share = np.where(turned, 1 - t, t)[:, None]
+        flipped = START[face] != FACES[2][face, 0]
+        share = np.where(flipped, 1 - t, t)[:, None]
         low, high = self.faces.ends[row].transpose(1, 0, 2)
         return low + share * (high - low)
 
-    def _beside(
+    def _partial(
         self,
         cells: NDArray[np.int64],
         local: NDArray[np.float64],
@@ -333,14 +333,14 @@ class RefilledCells:
                 at = np.flatnonzero(flat & np.isin(4 * cells + side, known))
                 if not len(at):
                     continue
-                here = 4 * cells[at] + side
-                key, X = self._nearest(bordered, order, here, a[at], b[at])
+                sides = 4 * cells[at] + side
+                key, X = self._nearest(bordered, order, sides, a[at], b[at])
                 middle = (a[at, 1 - axis] + b[at, 1 - axis]) / 2
-                covered = (middle > low[here]) & (middle < high[here])
-                at, here = at[covered], here[covered]
+                covered = (middle > low[sides]) & (middle < high[sides])
+                at, sides = at[covered], sides[covered]
                 key, X = key[covered], X[covered]
                 parent[at, face], ends[at, face] = key, X
-                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[here]
+                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[sides]
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
 
     @property
@@ -493,9 +493,9 @@ def _convex(corners: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[Polyg
         kept = [[(0, 1, NONE, NONE), (NONE, 2, NONE, 3)], [(1, 2, NONE, NONE), (NONE, 3, NONE, 0)]]
         areas = np.array([[Polygons.rings(ring[at][:, list(half)]).area for half in two] for two in halves])
         best = areas.min(axis=1).argmax(axis=0)
-        for way in (0, 1):
-            for half, numbers in zip(halves[way], kept[way], strict=True):
-                rows = at[best == way]
+        for diagonal in (0, 1):
+            for half, numbers in zip(halves[diagonal], kept[diagonal], strict=True):
+                rows = at[best == diagonal]
                 rows = rows[Polygons.rings(ring[rows][:, list(half)]).area > 0]
                 number = np.array([SIDE[k] if k != NONE else NONE for k in numbers])
                 out.append((ring[rows][:, list(half)], np.tile(number, (len(rows), 1))))

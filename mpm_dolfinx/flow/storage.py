@@ -332,11 +332,11 @@ class StorageSystem:
             flow = replace(flow, relative=relative)
         self.assemble_fluxes()
         total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # also of a cell without faces
-        aslant = None
+        nonorthogonal = None
         if off is not None:
             facets, gradients, sides = off
-            aslant = NonorthogonalFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
-        return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
+            nonorthogonal = NonorthogonalFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
+        return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
         """Assemble the matrix of fluxes between cells, in unsaturated soil at p; force: see `StorageForms.driven`."""

@@ -82,7 +82,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     factor = of.exp(both - one - other)
     k = factor * mean
     sides = ((rise0, x0, y0), (rise1, x1, y1))
-    slopes = (factor * rise + k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for rise, dx, dy in sides)
+    slopes = (factor * slope_k + k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for slope_k, dx, dy in sides)
     return Between(k, tuple(slopes))
 
 

@@ -387,9 +387,9 @@ def describe(simulation: Simulation) -> dict[str, Any]:
     return {**simulation.scene.description, **more}
 
 
-def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
+def _check_scene(file: Path, stored: dict[str, Any], present: dict[str, Any]) -> None:
     """Raise ValueError for the checkpoint of another scene."""
-    for name in {**there, **here}:
-        if there.get(name) != here.get(name):
-            both = f"{there.get(name)} there, {here.get(name)} here, must agree"
+    for name in {**stored, **present}:
+        if stored.get(name) != present.get(name):
+            both = f"{stored.get(name)} there, {present.get(name)} here, must agree"
             raise ValueError(f"{file}: checkpoint of another scene: {name}: {both}")

@@ -141,8 +141,8 @@ class Writer:
 
     def _start(self, result: Result) -> None:
         """Drop the output of later times from the folder: a new run continues it from here."""
-        if (began := result.rows[-2][0]) != self._t:
-            raise ValueError(f"writer: made at t = {self._t:g} s for a run that starts at t = {began:g} s")
+        if (start := result.rows[-2][0]) != self._t:
+            raise ValueError(f"writer: made at t = {self._t:g} s for a run that starts at t = {start:g} s")
         self._table.start(_row(Result(result.rows[-2:-1])))
         self._write_indices()
 
@@ -441,9 +441,9 @@ class Table:
         at_root(self.comm, write)
 
     def _check(self, row: dict[str, float]) -> None:
-        here, there = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
-        if here != there:
-            both = f"{', '.join(there)}, the run's {', '.join(here)}"
+        row_names, known = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
+        if row_names != known:
+            both = f"{', '.join(known)}, the run's {', '.join(row_names)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
     def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:

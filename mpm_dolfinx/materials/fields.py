@@ -79,8 +79,8 @@ class SceneMaterials:
         self._used = _used(bodies, len(materials))  # a material without a body has no effect
         evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
         locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
-        asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
-        each = zip(self._used, evaluated, asked, strict=True)
+        in_space = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
+        each = zip(self._used, evaluated, in_space, strict=True)
         known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
         """Number of axes of the deformation gradients of laws."""
@@ -130,7 +130,7 @@ class SceneMaterials:
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
             count = sum(len(body) for body in bodies if body.material == i)
-            self._add_shapes(_spread(m, values, count), seeded, len(points))
+            self._add_shapes(_expanded(m, values, count), seeded, len(points))
             here, rows = _rows(bodies, i, points.id)
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
@@ -177,8 +177,8 @@ class SceneMaterials:
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
-        if taken := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
-            raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
+        if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
+            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         m.check_cells(mean_size(self.grid))
@@ -217,7 +217,7 @@ class SceneMaterials:
             [name for name in dict.fromkeys([*common, *_takes(law)]) if name != ACROSS or (locks and known)]
             for law, locks, known in self._parts
         ]
-        shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
+        shapes = [{name: getattr(pieces, name).ufl_shape for name in some} for some in names]
         points = [FormPoints(pieces.grid, **s) for s in shapes]
         return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
@@ -334,7 +334,7 @@ class SceneMaterials:
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
         """Return a material with constants as arrays over some of its points; uniform materials remain unchanged."""
         values = {name: points.data[name][rows] for name in self._fields[i]}
-        return _spread(self.materials[i], values, len(rows)) if values else self.materials[i]
+        return _expanded(self.materials[i], values, len(rows)) if values else self.materials[i]
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return all parameters at the points (n, ...); zero if a point's law does not have them."""
@@ -578,7 +578,7 @@ def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
 
 def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
     """Return a material with its constants as arrays over the first of its points."""
-    return _spread(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
+    return _expanded(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
 
 
 def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
@@ -602,7 +602,7 @@ def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tupl
     return np.concatenate(here), np.concatenate(rows)
 
 
-def _spread(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
+def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
     """Return a copy of a material with values (n, ...) of some fields, its other numbers repeated n times."""
     out = copy(m)
     for name in constants_of(m):

@@ -101,10 +101,10 @@ class MohrCoulomb(Frictional):
         with np.errstate(invalid="ignore", divide="ignore"):  # of a diverging iterate, which is refused later
             e = np.log(x) / 2
         order = np.argsort(-e, axis=1, kind="stable")
-        back, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
+        undo, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
         ordered = np.take_along_axis(e, order, axis=1)
         stresses, slopes, flows = _returned(ordered, bulk, shear, sine, sine_flow, strength, cutoff)
-        stresses, slopes = np.take_along_axis(stresses, back, axis=1), slopes[n, back[:, :, None], back[:, None, :]]
+        stresses, slopes = np.take_along_axis(stresses, undo, axis=1), slopes[n, undo[:, :, None], undo[:, None, :]]
         tensor = Coaxial(x, axes, stresses, plane=trial["b"].shape[1] == len(PLANE))
         by_b = {"b": lambda: tensor.tangent(slopes / (2 * x[:, None, :]))}
         return {"stress": (tensor.values, by_b), "flows": (flows, {})}
@@ -122,8 +122,8 @@ class MohrCoulomb(Frictional):
         I = ufl.Identity(3)
         mean = ufl.tr(tau) / 3
         twice_strain = (tau - mean * I) / shear + 2 * mean / (3 * bulk) * I
-        b, back = Isotropic(twice_strain, plane)(ufl.exp), ufl.inv(F)
-        return {"plastic": ufl.conditional(ufl.gt(flows, 0.5), back * b * back.T, plastic)}
+        b, F_inverse = Isotropic(twice_strain, plane)(ufl.exp), ufl.inv(F)
+        return {"plastic": ufl.conditional(ufl.gt(flows, 0.5), F_inverse * b * F_inverse.T, plastic)}
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:

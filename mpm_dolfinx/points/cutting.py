@@ -267,9 +267,9 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     # an inverted simplex counts with positive volume: its negative volume is subtracted twice
     simplex, folded = np.nonzero(volume < 0)
     if len(folded):
-        turned = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
-        s = np.concatenate([s, turned, turned], axis=2)
-        outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
+        rotated = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
+        s = np.concatenate([s, rotated, rotated], axis=2)
+        outward = np.concatenate([outward, *[-_area_vectors(rotated)] * 2], axis=1)
         owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
     facet = np.arange(s.shape[2])
     for axis in range(d):

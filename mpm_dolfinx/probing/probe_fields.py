@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
-REACH = int(RADIUS)
+CELLS = int(RADIUS)
 """Cells along each axis from a probe's cell to the last one with a weight in `LocalFit`."""
 
 
@@ -49,11 +49,11 @@ class _Lattice:
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
-        d, width = grid.dim, 2 * REACH + 1
+        d, width = grid.dim, 2 * CELLS + 1
         copy, number = np.divmod(cell, grid.cells)
         index = np.stack(np.unravel_index(number, tuple(grid.shape)), axis=1)
         steps = np.stack(np.unravel_index(np.arange(width**d), (width,) * d), axis=1)
-        there = index[:, None] + steps - REACH
+        there = index[:, None] + steps - CELLS
         inside = ((there >= 0) & (there < grid.shape)).all(axis=2)
         number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
@@ -149,7 +149,7 @@ class _Around:
         start = np.zeros_like(groups)
         start[:, self._lattice.middle] = True
         reached, passes = start & self._filled, groups | start
-        for _ in range(2 * REACH * self._grid.dim):
+        for _ in range(2 * CELLS * self._grid.dim):
             for (axis, end), (here, there) in self._lattice.neighbours.items():
                 reached[:, there] |= (reached & passes)[:, here] & self._opening(axis, end)
         return reached & groups, reached

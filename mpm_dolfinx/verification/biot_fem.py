@@ -418,29 +418,29 @@ class BiotFEM:
         now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
         return self._whole * now + (1 - self._whole) * same
 
-    def _two_point(self, kappa, F, back, p, q, outlets: Sequence[Drained], weight):
+    def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL; weight: of fluid."""
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
-        stretch = ufl.det(F) * ufl.inner(back * normal, back * normal)
+        stretch = ufl.det(F) * ufl.inner(inverse * normal, inverse * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
         harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + TINY)
         around = self._around("+") if self.grid.axisymmetric else 1.0
-        way = across * self._in_plane(F) * normal
-        seen, drives = self._seen, ufl.jump(pi)
+        edge = across * self._in_plane(F) * normal
+        seen, difference = self._seen, ufl.jump(pi)
         if weight is not None:
-            fall = ufl.dot(weight("+"), (way("+") - way("-")) / 2)
-            drives += density_between(p("+"), p("-"), compliance) * fall
+            drop = ufl.dot(weight("+"), (edge("+") - edge("-")) / 2)
+            difference += density_between(p("+"), p("-"), compliance) * drop
         share = self._pores.between(seen("+"), seen("-")) * ufl.avg(stretch) / across("+")
-        flux = around * harmonic * share * drives * ufl.jump(q) * dS
+        flux = around * harmonic * share * difference * ufl.jump(q) * dS
         for o in outlets:
             outer = self._constant(o.pressure / self.scale)
-            drives = pi - self._constant(mass_potential(o.pressure, self.fluid.bulk) / self.scale)
+            difference = pi - self._constant(mass_potential(o.pressure, self.fluid.bulk) / self.scale)
             if weight is not None:
-                drives += density_between(p, outer, compliance) * ufl.dot(weight, way / 2)
-            flux += self._on(o, 2 * kappa * self._pores.between(seen, outer) * stretch / across * drives * q)
+                difference += density_between(p, outer, compliance) * ufl.dot(weight, edge / 2)
+            flux += self._on(o, 2 * kappa * self._pores.between(seen, outer) * stretch / across * difference * q)
         return flux
 
     def _solver(self) -> PETSc.SNES:
@@ -558,10 +558,10 @@ class BiotFEM:
             snes.solve(None, x)
             (first, last), _ = snes.getConvergenceHistory()
             norms.append(first)
-            asked = before - x.array_r[of_p]
-            taken = self._pores.reached(before, asked)
-            x.array_w[of_p] = before - taken
-            reached = self.grid.comm.allreduce(np.array_equal(taken, asked), op=MPI.LAND)
+            newton = before - x.array_r[of_p]
+            limited = self._pores.reached(before, newton)
+            x.array_w[of_p] = before - limited
+            reached = self.grid.comm.allreduce(np.array_equal(limited, newton), op=MPI.LAND)
             self._whole.value = float(reached and last < first)
             if reached and last <= max(absolute, relative * norms[0]):
                 reason = PETSc.SNES.ConvergedReason.CONVERGED_FNORM_RELATIVE
@@ -605,7 +605,7 @@ class BiotFEM:
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
-        result, began = Result(Rows([self._row(x)])), time.perf_counter()
+        result, start = Result(Rows([self._row(x)])), time.perf_counter()
         shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
         for _ in tqdm(range(steps), **shown):
             try:
@@ -614,7 +614,7 @@ class BiotFEM:
                 message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
                 raise GaveUp(message, result, failed.history) from failed
             result = result.after(Report(newton=newton, history=[(residual, 0.0)])).more(self._row(x))
-        return replace(result, wall=time.perf_counter() - began, converged=True)
+        return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, at reference positions x (m, d) in the body, on every process."""
@@ -637,9 +637,9 @@ class BiotFEM:
         out = np.zeros((len(x), size))
         x = x - self.grid.base
         cells = grid.local(grid.number(grid.index_from_base(x)))
-        here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
-        if len(here):
-            out[here] = f.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, size)
+        local = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
+        if len(local):
+            out[local] = f.eval(np.pad(x[local], ((0, 0), (0, 3 - grid.dim))), cells[local]).reshape(-1, size)
         return grid.comm.allreduce(out)
 
     def _row(self, x: NDArray[np.float64]) -> Row:
