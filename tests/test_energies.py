@@ -49,6 +49,19 @@ def test_a_block_that_falls_gains_what_its_weight_does():
     assert e["kinetic"][0] == pytest.approx(RHO * 0.4**2 * 0.1 / 2, rel=1e-9)
 
 
+def test_a_block_of_moist_soil_gains_what_its_own_weight_does():
+    """Its pores are half full, so a block of saturated weight would gain a ninth more."""
+    grid = mpm.Grid([0, 0], [1, 4], [5, 20])
+    block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])
+    law = {"porosity": 0.4, "grain_density": 2600.0, "retention": mpm.VanGenuchten(1e4, n=2.0), "conductivity": 1e-6}
+    soil = mpm.Hencky(bulk=2e7, shear=1e7, **law)
+    options = {"walls": {}, "gravity": (0, -9.81), "inertia": True, "pressure": lambda x: -np.sqrt(3) * 1e4}
+    s = mpm.Simulation(grid, [block], [soil], fluid=mpm.Fluid(), **options)
+    result = s.run(0.5, 0.025, energies=True, progress=False)
+    drop = (0.6 * 2600 + 0.4 * 0.5 * 1000) * 0.4**2 * 9.81**2 / 8
+    assert result.energies["external"][-1] == pytest.approx(drop, rel=1e-3) and off(result) < 5e-3
+
+
 def test_soil_that_yields_dissipates_what_is_lost():
     """A wall of clay thrown aside on its foot comes to rest; its stresses store the energy of Hencky's law."""
     grid = mpm.Grid([0, 0], [2.4, 1.2], [16, 8])

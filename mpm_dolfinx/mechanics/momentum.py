@@ -512,13 +512,14 @@ class MomentumProblem:
         out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "friction": 0.0}
         out["external"] = 0.0
         for one in self.loads:
-            acts, resists = np.zeros((2, len(v)))  # contributions to ghosts count on this process
+            acts, resists, taken = np.zeros((3, len(v)))  # contributions to ghosts count on this process
             one.dead(acts)
             one.loads(acts)
+            one.takes_up(taken)
             one.resists(resists)
             pushed = unknowns.vector()
             one.push(self.at, pushed, unknowns)
-            out["external"] += acts @ v + one.pulling(self.at, v) - v[unknowns.owned] @ pushed.array_r
+            out["external"] += (acts - taken) @ v + one.pulling(self.at, v) - v[unknowns.owned] @ pushed.array_r
             out["viscous"] += resists @ v
             rubs, more = one.rubbing(self.at, v)
             out["friction"] += rubs
