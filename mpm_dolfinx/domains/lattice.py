@@ -149,13 +149,12 @@ def _change(
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
-    owner = np.searchsorted(starts, layer, side="right") - 1
-    exchange = Exchange(comm, owner)
+    rank = np.searchsorted(starts, layer, side="right") - 1
+    exchange = Exchange(comm, rank)
     rows = [(exchange.send(number), exchange.send(values))]
     for other in range(-MARGIN, MARGIN + 1) if comm.size > 1 else ():  # a slab may be one layer thin
-        to = np.clip(owner + other, 0, comm.size - 1)
-        near = (to != owner) & (to == owner + other)
-        near &= (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
+        to = np.clip(rank + other, 0, comm.size - 1)
+        near = (to != rank) & (to == rank + other) & (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
         halo = Exchange(comm, to[near])
         rows.append((halo.send(number[near]), halo.send(values[near])))
     first = max(0, starts[comm.rank] - MARGIN)
