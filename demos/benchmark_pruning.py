@@ -209,6 +209,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: block(n, inertia=True),
         lambda n: block(n, inertia=True, conditions=[mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), mass=1.0)]),
     ),
+    "free disc that rotates and touches nothing": (
+        lambda n: block(n, inertia=True),
+        lambda n: block(n, inertia=True, conditions=[mpm.Tool(mpm.Ball((0.5, 20.0), 0.1), mass=1.0, spin=1.0)]),
+    ),
     "quiet side": (
         lambda n: block(n, inertia=True),
         lambda n: block(n, inertia=True, conditions=[mpm.Quiet("right")]),

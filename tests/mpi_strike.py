@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Let a rough tool with a mass strike a block that slides on another one, on any number of processes."""
+"""Let a rough spinning disc strike a block that slides on another one, on any number of processes."""
 
 import sys
 
@@ -10,7 +10,7 @@ import mpm_dolfinx as mpm
 grid = mpm.Grid([0, 0], [1.6, 1.2], [16, 12])
 blocks = [mpm.box(grid, [0.1, 0], [1.5, 0.43]), mpm.box(grid, [0.33, 0.43], [1.13, 0.77])]
 soil = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
-tool = mpm.Tool(mpm.HalfSpace((0, 0.775), (0, -1)), mass=50.0, velocity=(0.4, -0.5), friction=0.3)
+tool = mpm.Tool(mpm.Ball((0.73, 1.775), 1.0), mass=50.0, velocity=(0.4, -0.5), spin=2.0, friction=0.3)
 simulation = mpm.Simulation(
     grid,
     blocks,
@@ -34,6 +34,7 @@ if parts:
         shear=s[order],
         forces=simulation.tool_forces.array,
         tool=[simulation.tool_travel["tool"], simulation.outcome("tool_velocity")["tool"]],
+        spin=[simulation.outcome(name)["tool"] for name in ("tool_rotation", "tool_spin")],
         energies=[of[-1] for of in result.energies.values()],
         balance=result.balance,
         counts=[len(part[0]) for part in parts],

@@ -7,6 +7,8 @@ from meshes import box_mesh
 from test_inertia import Bar
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.mechanics.inertia import velocity_gradients
+from mpm_dolfinx.points.cutting import spreads
 
 G = 9.81
 STIFF = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
@@ -113,7 +115,10 @@ def test_a_block_that_friction_holds_stays():
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, 0.1])
 def test_a_disc_rolls_down_an_incline_or_slips(friction):
-    """Exact: it rolls by 2/3 g sin b where mu >= tan b / 3; else it slides by g (sin b - mu cos b)."""
+    """Exact: it rolls by 2/3 g sin b where mu >= tan b / 3; else it slides by g (sin b - mu cos b).
+
+    Its spin grows by a / R, or by 2 mu g cos b / R.
+    """
     pytest.importorskip("gmsh")
     angle, turn, radius, t = np.pi / 6, -np.pi / 6, 0.15, 0.4
     e = np.array([np.cos(turn), np.sin(turn)])
@@ -124,12 +129,23 @@ def test_a_disc_rolls_down_an_incline_or_slips(friction):
     disc = mpm.polygon(grid, foot + radius * (normal + np.stack([np.cos(around), np.sin(around)], axis=1)), sides="rim")
     floor = mpm.Tool(mpm.HalfSpace(tuple(foot), tuple(normal)), friction=friction)
     gravity = G * (np.sin(angle) * e - np.cos(angle) * normal)
-    s = mpm.Simulation(grid, [disc], [STIFF], walls={}, conditions=[floor], gravity=gravity, inertia=True)
+    rubber = mpm.Hencky(bulk=1e8, shear=6e7, grain_density=2000.0)
+    s = mpm.Simulation(grid, [disc], [rubber], walls={}, conditions=[floor], gravity=gravity, inertia=True)
     start = of_centre(s, s.points.x)
     s.run(t, 0.01, progress=False)
     a = max(2 / 3 * G * np.sin(angle), G * (np.sin(angle) - friction * np.cos(angle)))
     assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(a * t**2 / 2, rel=0.01)
     assert of_centre(s, s.points.data["velocity"]) @ e == pytest.approx(a * t, rel=0.01)
+    assert spin_of(s) == pytest.approx(min(a, 2 * friction * G * np.cos(angle)) * t / radius, rel=0.01)
+
+
+def spin_of(s):
+    """Return the clockwise angular velocity of the whole body, rad/s."""
+    m, off = mass(s), s.points.x - of_centre(s, s.points.x)
+    v = s.points.data["velocity"] - of_centre(s, s.points.data["velocity"])
+    L, spread = velocity_gradients(s.points), spreads(s.points.corners, False)
+    turn = off[:, 0] * v[:, 1] - off[:, 1] * v[:, 0] + (L @ spread)[:, 1, 0] - (L @ spread)[:, 0, 1]
+    return -(m @ turn) / (m @ ((off**2).sum(axis=1) + np.trace(spread, axis1=1, axis2=2)))
 
 
 def test_a_tool_that_pushes_ever_faster_has_its_acceleration_from_the_first_step_on():

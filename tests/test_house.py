@@ -15,7 +15,7 @@ CEILINGS = {
     "assignments of three and more values": 20,
     "changes of hidden state": 9,
     "files that name a condition's class, most": 6,
-    "lines of the package": 36466,
+    "lines of the package": 36660,
 }
 
 

@@ -141,7 +141,7 @@ def test_what_fluxes_gain_by_displacements_is_what_their_residual_does():
     move(bent, 1.0)
     storage.assemble_tangent()
     out, content, there = system.unknowns.vector(), system.unknowns.vector(), []
-    slope = storage.flux_slope(u, unknowns, momentum.forms.active.dofs)
+    slope = storage.flux_slope(u, unknowns, momentum.forms.active.now.dofs)
     system.change_by(v, out, slope)
     system.change_by(v, content)
     for step in (1e-6, -2e-6):

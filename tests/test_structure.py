@@ -65,7 +65,7 @@ CHANGES = {
     ("Grid", "_cells"): "the mesh, made at its first use",
     ("CompiledForm", "_last"): "the last binding of a form",
     ("Latest", "_entry"): "the last key and value",
-    ("Active", "_now"): "the filled cells since the grid reset",
+    ("Active", "now"): "the filled cells since the grid reset",
     ("Scene", "_looks"): "the warnings that are still possible",
     ("SideFeeds", "_flows"): "the active set of seepage faces",
     ("SideFeeds", "_nonorthogonal"): "the non-orthogonal flow at the start of the substep",
@@ -78,7 +78,7 @@ CHANGES = {
     ("Table", "columns"): "of a file that begins with its first row",
     ("Checkpoint", "_written"): "the time of the last file",
 }
-"""All changes of objects after their construction, and why these are no part of the state; others are hidden state."""
+"""All that objects change after they are made, and why it is no part of the state; what else changes is hidden."""
 
 
 def test_nothing_else_is_set_outside_of_init():

@@ -98,6 +98,7 @@ BENCHMARK = {
     "inertia": {"inertia"} | SECOND,
     "inertia of wet soil, two substeps in both": {"inertia", "weight of the fluid"},
     "free tool that touches nothing": {"tools"},
+    "free disc that rotates and touches nothing": {"tools"},
     "quiet side": {"quiet sides"},
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},

@@ -25,7 +25,6 @@ SUBDOMAIN = 1  # the one subdomain id of all measures
 
 if OLD:
     from dolfinx import jit
-    from dolfinx.fem.assemble import pack_coefficients as _pack_coefficients
 else:
     import basix.ufl
     from dolfinx import graph
@@ -208,28 +207,24 @@ class CompiledForm:
     def packed(self, form=None) -> dict:
         """Return dolfinx's own packed coefficients, one row an entity."""
         form = form or self.form
-        return _pack_coefficients(form) if OLD else cpp.fem.pack_coefficients(form)
+        return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
         """Add the vector to `b`, ghosts not summed; rows: coefficients, one row an entity, instead of dolfinx's."""
         form = form or self.form
-        cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), self._coefficients(rows, form))
+        packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
+        cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
         """Add the matrix to `A`, with dofs unrolled and without final assembly; rows: as for the vector."""
         form = form or self.form
-        constants = cpp.fem.pack_constants(form)
-        cpp.fem.petsc.assemble_matrix(A, form, constants, self._coefficients(rows, form), [], unrolled=True)
-
-    def _coefficients(self, rows, form) -> dict:
-        if rows is None:
-            return self.packed(form)
-        # keys are integral numbers in 0.11, subdomain ids before
-        return {(fem.IntegralType.cell, key): rows for key in self._keys}
+        packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
+        cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)
 
     @cached_property
-    def _keys(self) -> list[int]:
-        return [key for _, key in self.packed()] or [SUBDOMAIN]
+    def _keys(self) -> list[tuple]:
+        """Keys of the coefficients: integral numbers in 0.11, subdomain ids before."""
+        return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 
 def _mesh_of(form: ufl.Form):

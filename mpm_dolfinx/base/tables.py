@@ -67,7 +67,8 @@ def _axes(dim: int, size: int) -> list[str]:
 
 def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
     """Return the unit of an outcome; in plane strain, per metre of thickness."""
-    units = {"tool_travel": "m", "tool_velocity": "m/s", "outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
+    units = {"tool_travel": "m", "tool_velocity": "m/s", "tool_rotation": "rad", "tool_spin": "rad/s"}
+    units |= {"outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
     units |= dict.fromkeys(("flowed", "ran_off", "ponded"), "m^3")
     whole = units.get(quantity, "N m" if moment else "N")
     of_slice = {"N": "N/m", "N m": "N", "m^3/s": "m^2/s", "m^3": "m^2", "J": "J/m"}

@@ -191,8 +191,12 @@ def _parameters(function: Callable) -> list[Parameter] | None:
 
 def takes(function: Callable) -> tuple[str, ...] | None:
     """Return the names among t, X and x with which a function is called; None for other parameters."""
-    parameters = _parameters(function)
-    names = ("t",) if parameters is None else tuple(p.name for p in parameters)
+    return _names(function, _parameters(function))
+
+
+def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
+    """Return the same, given the parameters."""
+    names = ("t",) if parameters is None else tuple([p.name for p in parameters])
     if len(names) == 1 and names[0] not in PLACES:
         return ("t",)
     if not names or not set(names) <= set(NAMES):
@@ -230,7 +234,7 @@ def called(function: Callable, values: dict) -> object:
     parameters = _parameters(function)
     if parameters is None:
         return function(values["t"])
-    by_name = {p.name: values[name] for p, name in zip(parameters, takes(function), strict=True)}
+    by_name = {p.name: values[name] for p, name in zip(parameters, _names(function, parameters), strict=True)}
     alone = {p.name for p in parameters if p.kind == p.KEYWORD_ONLY}
     positional = [value for name, value in by_name.items() if name not in alone]
     return function(*positional, **{name: by_name[name] for name in alone})

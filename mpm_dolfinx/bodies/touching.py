@@ -88,14 +88,13 @@ class Cover:
 def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
     """Return the outward area vectors (m, d), m^(d-1), of faces of domains (m, 2^d, d), by face numbers (m,) or one."""
     dim = corners.shape[2]
-    index = np.broadcast_to(FACES[dim][face], (len(corners), 2 ** (dim - 1)))
-    x = np.take_along_axis(corners, index[:, :, None], axis=1)
+    x = corners[np.arange(len(corners))[:, None], FACES[dim][face]]
     if dim == 2:
         t = x[:, 1] - x[:, 0]
-        n = np.stack([t[:, 1], -t[:, 0]], axis=1)
+        n = np.array([t[:, 1], -t[:, 0]]).T
     else:
         n = 0.5 * np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1])
-    return n * np.broadcast_to(_OUTWARD[dim][face], len(n))[:, None]
+    return n * _OUTWARD[dim][face].reshape(-1, 1)
 
 
 _OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}

@@ -36,6 +36,8 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """Effects of conditions on the bodies, by quantity, such as "reactions", and by name of the condition."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Quantities of the package's own conditions."""
+MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
+"""Quantities of free tools."""
 
 
 class FormsOf:

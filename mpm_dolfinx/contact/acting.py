@@ -9,13 +9,13 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Shares
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Outcome, Place, Setting, Shares
 from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import Contacts
 from mpm_dolfinx.contact.problem import ContactProblem, Gone
 from mpm_dolfinx.contact.tool import Tool
-from mpm_dolfinx.contact.tool_placing import NEAR, Tools, Ways
+from mpm_dolfinx.contact.tool_placing import NEAR, Tools, Ways, ways_of
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.mechanics.given_displacements import held_faces
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -75,14 +75,26 @@ class ToolsOfStage(Touching):
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
         if self.found.free:
             out["tool_velocity"] = {name: tool.begins(d) for name, tool in tools.items() if tool.free}
+        turning = dict(zip(self.names, self.found.turning, strict=True))
+        if any(turning.values()):
+            out["tool_rotation"] = {name: np.array(0.0) for name, turns in turning.items() if turns}
+            out["tool_spin"] = {name: np.array(float(tools[name].spin)) for name, turns in turning.items() if turns}
         return out
 
     def _ways(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements by loads before a step (tools,), m; with free tools (tools, d)."""
-        gone = [place.before["tool_travel"][name] for name in self.names]
+        """Return displacements by loads before a step (tools,), m; with free tools (tools, q), and rotations."""
         if self.found.free:
-            gone = [np.broadcast_to(way, (self._grid.dim,)) for way in gone]
-        return np.array(gone, dtype=float)
+            return self._of_free(place.before, "tool_travel", "tool_rotation")
+        return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
+
+    def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
+        """Return displacements and rotations, or velocities, (tools, q), zero for tools that are not free."""
+        d = self._grid.dim
+        out = np.zeros((len(self.names), ways_of(d)))
+        for row, name in zip(out, self.names, strict=True):
+            row[:d] = before[along].get(name, 0.0)
+            row[d:] = before.get(around, {}).get(name, 0.0)
+        return out
 
     def placed(self, place: Place) -> Loads:
         """Return the contact with the tools in a substep."""
@@ -91,9 +103,7 @@ class ToolsOfStage(Touching):
         placed = tools, place.cut, place.points, ways, (place.start, place.t)
         if not self.found.free:
             return ToolLoads(*placed)
-        velocity = np.zeros_like(ways)
-        for k, name in enumerate(self.names):
-            velocity[k] = place.before["tool_velocity"].get(name, 0.0)
+        velocity = self._of_free(place.before, "tool_velocity", "tool_spin")
         options = {"velocity": velocity, "pushes": self.found.pushes(place.t)}
         return FreeToolLoads(*placed, mass=self.found.masses, guides=self.found.guides, **options)
 

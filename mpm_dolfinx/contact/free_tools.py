@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Free tools: rigid tools with mass, moved by weight, loads and contact forces.
 
-The displacement q of a tool of mass m in a step follows m (q - q^) / (own dt)^2 = l - sum f, as for nodes
-(`mechanics/inertia.py`).  Here q^ is its free flight, l its load, and f are the contact forces on the points.  q is
-condensed.  Let D be minus the derivative of f by the displacement of the points, S = sum D + m / (own dt)^2, and dw
-their increment.  Newton's method then gives
+The motion q of a tool in a step, its displacement and in 2D its rotation, follows, as for nodes
+(`mechanics/inertia.py`), m (q - q^) / (own dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, q^ is the
+free flight, l the load, and f are the contact forces on the points.  A q moves the places of the points with the
+tool: it has the columns e_x, e_y, and e_z x r, with the lever arm r.  q is condensed.  Let D be minus the derivative
+of f by the displacement of the points, and dw their increment.  Forces rotate with the tool, so f changes by (D A +
+E) dq, and the force on the tool by
 
-    dq = S^-1 (l - sum f - m (q - q^) / (own dt)^2 + sum D dw),
+    A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f,
 
-so forces on the points are f + D S^-1 (...), and minus their derivative is D - D S^-1 D.
+where E has the columns 0, 0, e_z x f.  With S, the sum of this matrix and m / (own dt)^2, Newton's method gives
+
+    dq = S^-1 (l - sum A^T f - m (q - q^) / (own dt)^2 + sum (A^T D + E^T) dw),
+
+so forces on the points are f + (D A + E) S^-1 (...), and minus their derivative is D - (D A + E) S^-1 (A^T D + E^T).
 """
 
 from __future__ import annotations
@@ -27,8 +33,8 @@ from mpm_dolfinx.mechanics.inertia import Flight
 
 
 class Goes(NamedTuple):
-    """Linearised motion of free tools at w (m, d), m: displacement travel + shift (k, d), m, plus inverse (k, d, d) of
-    S times further forces.
+    """Linearised motion of free tools at w (m, d), m: motion travel + shift (k, q), plus inverse (k, q, q) of S times
+    further forces.
 
     found: contact at w.
     """
@@ -41,8 +47,8 @@ class Goes(NamedTuple):
 
 
 class Met(NamedTuple):
-    """Equation of motion of free tools: inverse (k, d, d) of S; off (k,): relative out-of-balance force; shift (k, d):
-    Newton increment, m.
+    """Equation of motion of free tools: inverse (k, q, q) of S; off (k,): relative out-of-balance force; shift (k, q):
+    Newton increment, m, rad.
     """
 
     inverse: NDArray[np.float64]
@@ -58,9 +64,10 @@ class FreeTools(ContactProblem):
     placed
         Arguments of `ToolLoads`.
     mass, guides
-        Masses (k,), kg, 0 for tools that are not free; projections (k, d, d) on their directions of motion.
+        Masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free; projections (k, q, q) on
+        their motions, see `ways_of`.
     velocity, pushes
-        Velocities (k, d), m/s, at the start of the step; loads (k, d), N.
+        Velocities (k, q), m/s and rad/s, at the start of the step; loads (k, q), N and N m.
     """
 
     couples = True
@@ -68,9 +75,10 @@ class FreeTools(ContactProblem):
     def __init__(self, *placed, mass: NDArray, guides: NDArray, velocity: NDArray, pushes: NDArray):
         super().__init__(*placed)
         self._mass, self._guides = mass, guides
+        self._free_tools = mass[:, 0] > 0
         self._pushes = pushes
         self.flight = Flight(velocity, velocity)
-        """Velocities and accelerations of the tools (k, d), m/s and m/s^2, at the start of the substep."""
+        """Velocities and accelerations of the tools (k, q), m/s and m/s^2, at the start of the substep."""
         self._rate, self._free = 0.0, np.zeros_like(velocity)
 
     def begun(self, shares: Shares, gone: Gone | None) -> FreeTools:
@@ -79,7 +87,9 @@ class FreeTools(ContactProblem):
         if gone is not None:
             out.flight = gone.flight
         if shares.gravity is not None:
-            out._pushes = self._pushes + self._mass[:, None] * (self._guides @ shares.gravity)
+            pulls = np.zeros_like(self._pushes)
+            pulls[:, : self.grid.dim] = shares.gravity
+            out._pushes = self._pushes + np.einsum("kij,kj->ki", self._guides, self._mass * pulls)
         out._rate, out._free = shares.own**-2, out.flight.free(shares.own, shares.before)
         out.now = self.now._replace(ways=out._goes(np.zeros_like(self.pairs.x), out._free))
         return out
@@ -90,13 +100,13 @@ class FreeTools(ContactProblem):
 
     def tool_velocity(self, at: At) -> NDArray[np.float64]:
         """See `ContactProblem`."""
-        free = (self._mass > 0)[self.pairs.number, None]
-        return np.where(free, self._after(at).velocity[self.pairs.number], super().tool_velocity(at))
+        free = self._free_tools[self.pairs.number, None]
+        return np.where(free, self._moved(self.found(at), self._after(at).velocity), super().tool_velocity(at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """See `Loads`: contact forces change the energy of a free tool, and loads do work on it."""
         rubs, more = super().rubbing(at, v)
-        free = (self._mass > 0)[self.pairs.number]
+        free = self._free_tools[self.pairs.number]
         more -= float((self.found(at).touch.force * self.tool_velocity(at))[free].sum())
         pushed = float((self._pushes * self._after(at).velocity).sum())
         return rubs, more + pushed * (self.grid.comm.rank == 0)
@@ -113,22 +123,39 @@ class FreeTools(ContactProblem):
         found = super()._find_at(w, way)
         if way.ndim == 1:  # before the first substep
             return found
-        law = self.now.law
-        shift = self._met(found).shift[self.pairs.number]
-        return found._replace(balanced=found.touch.force + law.slope(found.touch, found.at, shift))
+        return found._replace(balanced=found.touch.force + self._pulled(found, self._met(found).shift))
+
+    def _moved(self, found: Found, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return A q (m, d): motion at the points by motions (k, q) of the tools."""
+        d, of = self.grid.dim, q[self.pairs.number]
+        return of[:, :d] + of[:, d:] * across(found.at.arm) if d == 2 else of
+
+    def _pulled(self, found: Found, q: NDArray[np.float64], adjoint: bool = False) -> NDArray[np.float64]:
+        """Return (D A + E) q (m, d), N, of motions (k, q) of the tools, or with the adjoint of D."""
+        out = self.now.law.slope(found.touch, found.at, self._moved(found, q), adjoint)
+        d = self.grid.dim
+        return out + q[self.pairs.number, d:] * across(found.touch.force) if d == 2 else out
+
+    def _onto(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return A^T f (m, q) of forces (m, d), N, at the points."""
+        moment = (across(found.at.arm) * force).sum(axis=1, keepdims=True)[:, : self.grid.dim == 2]
+        return np.hstack([force, moment])
 
     def _travel(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (k, d), m, of tools at w (m, d), m, along the last Newton step."""
+        """Return the motions (k, q) of tools at w (m, d), m, along the last Newton step."""
         goes = self.now.ways
         law = self.now.law
-        moved = law.slope(goes.found.touch, goes.found.at, w - goes.w)
-        on = law.by_contact(np.column_stack([(w != goes.w).any(axis=1), moved]))
+        dw = w - goes.w
+        moved = self._onto(goes.found, law.slope(goes.found.touch, goes.found.at, dw))
+        d = self.grid.dim
+        moved[:, d:] += (across(goes.found.touch.force) * dw).sum(axis=1, keepdims=True)[:, : d == 2]
+        on = law.by_contact(np.column_stack([(dw != 0).any(axis=1), moved]))
         if not on[:, 0].any():
             return goes.travel
         return goes.travel + goes.shift + np.einsum("kij,kj->ki", goes.inverse, on[:, 1:])
 
     def _goes(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Goes:
-        """Return the linearised motion of tools with displacements (k, d), m, for bodies at w (m, d), m."""
+        """Return the linearised motion of tools after motions (k, q), for bodies at w (m, d), m."""
         found = self._find_at(w, travel)
         met = self._met(found)
         return Goes(w, travel, met.shift, met.inverse, found)
@@ -136,25 +163,30 @@ class FreeTools(ContactProblem):
     def _met(self, found: Found) -> Met:
         """Return the equation of motion of the tools at a contact."""
         law = self.now.law
-        of, d = self.pairs.number, self.grid.dim
-        columns = [law.slope(found.touch, found.at, self._guides[of, :, i]) for i in range(d)]
-        sums = law.by_contact(np.stack([found.touch.force, *columns], axis=2).reshape(len(of), -1))
-        sums = np.einsum("kij,kjl->kil", self._guides, sums.reshape(-1, d, d + 1))
-        heavy = (self._rate * self._mass)[:, None]
-        S = sums[:, :, 1:] + heavy[:, :, None] * np.eye(d)
-        free = self._mass > 0
+        d = self.grid.dim
+        motions = self._guides.transpose(2, 0, 1)
+        columns = [self._onto(found, self._pulled(found, q)) for q in motions]
+        onto = self._onto(found, found.touch.force)
+        sums = law.by_contact(np.stack([onto, np.abs(onto), *columns], axis=2).reshape(len(onto), -1))
+        sums = sums.reshape(len(motions[0]), len(motions), -1)
+        S = sums[:, :, 2:]
+        if d == 2:  # the lever arm changes as the tool moves
+            S[:, d, :d] += np.einsum("kij,ki->kj", self._guides[:, :d, :d], across(sums[:, :d, 0]))
+        back = self._rate * self._mass * (found.travel - self._free)
+        S = self._guides @ S + (self._rate * self._mass)[:, None] * np.eye(len(motions))
+        free = self._free_tools
         inverse = np.zeros_like(S)
         inverse[free] = self._guides[free] @ np.linalg.inv(S[free])
-        back = heavy * (found.travel - self._free)
-        off = self._pushes - back - sums[:, :, 0]
-        parts = np.linalg.norm([self._pushes, back, sums[:, :, 0]], axis=2).max(axis=0)
-        share = np.linalg.norm(off, axis=1) / np.where(parts > 0, parts, 1.0)
+        off = self._pushes - back - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
+        scale = np.maximum(np.abs([self._pushes, back]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
+        scale[:, :d] = np.linalg.norm(scale[:, :d], axis=1, keepdims=True)
+        share = (np.abs(off) / np.where(scale > 0, scale, 1.0)).max(axis=1)
         return Met(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 
     def pattern(self, unknowns) -> PETSc.Mat | None:
         """See `Loads`: all nodes under a free tool are coupled."""
         out = None
-        for number in np.flatnonzero(self._mass > 0):
+        for number in np.flatnonzero(self._free_tools):
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
             more = outer(own, own)
             out = more if out is None else out + more
@@ -165,16 +197,14 @@ class FreeTools(ContactProblem):
         """See `Loads`."""
         K = super().coupling(at)
         found = self.found(at)
-        law = self.now.law
         inverse = self._met(found).inverse
-        for k in np.flatnonzero(self._mass > 0):
-            on = (self.pairs.number == k)[:, None]
-            for e, to in zip(np.eye(self.grid.dim), inverse[k].T, strict=True):
-                sides = (
-                    self._nodal(unknowns := at.unknowns, law.slope(found.touch, found.at, on * to)),
-                    self._nodal(unknowns, law.slope(found.touch, found.at, on * e, adjoint=True)),
-                )
-                K.axpy(-1.0, outer(*sides), PETSc.Mat.Structure.UNKNOWN)
+        for k in np.flatnonzero(self._free_tools):
+            on = (np.arange(len(inverse)) == k)[:, None]
+            for e, to in zip(np.eye(inverse.shape[1]), inverse[k].T, strict=True):
+                if to.any():
+                    pulled = self._pulled(found, on * to), self._pulled(found, on * e, adjoint=True)
+                    sides = (self._nodal(at.unknowns, values) for values in pulled)
+                    K.axpy(-1.0, outer(*sides), PETSc.Mat.Structure.UNKNOWN)
         return K
 
     def settle(self, at: At, sticks: bool) -> bool:
@@ -196,9 +226,23 @@ class FreeTools(ContactProblem):
         return True
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`: with velocities (d,), m/s."""
+        """See `Loads`: with velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
         out = super().outcome(at)
-        for k in np.flatnonzero(self._mass == 0):
-            out["tool_travel"][self.now.law.names[k]] = np.array(0.0)
-        free, velocity = np.flatnonzero(self._mass > 0), self._after(at).velocity
-        return out | {"tool_velocity": {self.now.law.names[k]: velocity[k] for k in free}}
+        d, names = self.grid.dim, self.now.law.names
+        way, velocity = self.pushes.start + self.found(at).travel, self._after(at).velocity
+        turns = self._guides[:, -1, -1]
+        out["tool_travel"] = {
+            name: way[k, :d] if self._free_tools[k] else np.array(0.0) for k, name in enumerate(names)
+        }
+        out["tool_velocity"] = {names[k]: velocity[k, :d] for k in np.flatnonzero(self._free_tools)}
+        if d == 2 and turns.any():
+            out |= {
+                quantity: {names[k]: np.array(of[k, d]) for k in np.flatnonzero(turns)}
+                for quantity, of in (("tool_rotation", way), ("tool_spin", velocity))
+            }
+        return out
+
+
+def across(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return e_z x v of vectors v (m, 2)."""
+    return np.stack([-v[:, 1], v[:, 0]], axis=1)

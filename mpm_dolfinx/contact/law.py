@@ -159,16 +159,22 @@ class ContactLaw:
         normal = self.mean(at.n)
         on[self.of[touches]] = True
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
-        friction = _, _, shear, *_ = self._friction(state, normal, self.mean(at.slip), pressure, on)
+        means = self.mean(at.slip), self.mean(at.shear)
+        friction = _, _, shear, *_ = self._friction(state, normal, *means, pressure, on)
         force = self.pairs.area[:, None] * (push[:, None] * at.n + shear[self.of])
         return Touch(force, push, stiffness * touches, pressure, *friction)
 
-    def _friction(self, state: ContactState, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
-        """Return the fields of `Touch` from `sticks` on; n, slip (k, d): mean normals and slips, m."""
+    def _friction(
+        self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
+    ) -> tuple:
+        """Return the fields of `Touch` from `sticks` on.
+
+        n, slip, old (k, d): means of normals, of slips, m, and of tractions before the step, Pa.
+        """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips
-        trial = np.einsum("kij,kj->ki", P, self.mean(self.pairs.shear) * on[:, None] - hold[:, None] * slip)
+        trial = np.einsum("kij,kj->ki", P, old * on[:, None] - hold[:, None] * slip)
         size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
         onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until an update
@@ -281,11 +287,10 @@ class ContactLaw:
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
         return self.by_contact(np.hstack([force, cross]))
 
-    def tractions(self, touch: Touch) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
         Pairs in stick keep their deviation from the mean of the cell, because repeated averaging would cause creep.
         """
-        old = self.pairs.shear
-        off = (old - self.mean(old)[self.of]) * touch.sticks[self.of, None]
+        off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

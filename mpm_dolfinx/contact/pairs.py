@@ -32,7 +32,7 @@ class Geometry(NamedTuple):
 
     gap (m,): m, negative in penetration; n (m, d): its derivative by w, the outward unit normal of the other side;
     curvature (m, d, d): second derivative, 1/m, None if zero; slip (m, d): in the step, m; arm (m, d): lever arm of
-    moments, m.
+    moments, m; shear (m, d): traction before the step, rotated with the tool, Pa.
     """
 
     gap: NDArray[np.float64]
@@ -40,6 +40,7 @@ class Geometry(NamedTuple):
     curvature: NDArray[np.float64] | None
     slip: NDArray[np.float64]
     arm: NDArray[np.float64]
+    shear: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ class Pairs:
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
         """Return the geometry at w (m, d), m, for displacements of tools by loads (contacts,), m, in the step.
 
-        travel: (contacts, d), m, with free tools.
+        travel: with free tools (contacts, q): displacements, m, and rotations, rad.
         """
         raise NotImplementedError
 
@@ -110,11 +111,17 @@ class ToolPairs(Pairs):
         middle = np.zeros((m, d))
         gone = travel if travel.ndim > 1 else travel[:, None] * [tool.along(d) for tool in self.tools]
         x = self.now + w
+        carried = self.carried + gone[self.number, :d]
+        shear = self.shear.copy()
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
                 solid, rows = tool.solid(h), np.flatnonzero(self.number == number)
-                pose = pose._replace(shift=pose.shift + gone[number])
+                before, pose = pose, pose.gone(gone[number])
+                if pose.R is not before.R:
+                    turn = pose.R @ before.R.T
+                    carried[rows] = pose.put(before.own(self.carried[rows]))
+                    shear[rows] = shear[rows] @ turn.T
                 y, middle[rows] = pose.own(x[rows]), pose.centre + pose.shift
                 gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
                 second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
@@ -122,7 +129,7 @@ class ToolPairs(Pairs):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
         everywhere(self.grid, ask)
-        return Geometry(gap, n, second, x - self.carried - gone[self.number], x - middle)
+        return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
     def reach(self) -> NDArray[np.float64]:
@@ -149,7 +156,7 @@ class FacePairs(Pairs):
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
         """See `Pairs`; moments refer to the positions at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.apart + w)
-        return Geometry(gap, self.n, None, w, self.x + self.grid.base)
+        return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""

@@ -385,7 +385,8 @@ class ContactProblem(Loads):
         """Return the points with the contact pressures and shear tractions at u."""
         law, origin, *_ = self.now
         contacts = dict(zip(law.names, law.contacts, strict=True))
-        return origin.means(contacts, points, *law.tractions(self.found(at).touch))
+        found = self.found(at)
+        return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """See `Loads`: only tools do work; elastic slip in stick is counted as dissipation, and returned on unloading.

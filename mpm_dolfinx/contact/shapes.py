@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +42,13 @@ def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
+
+
+class Uniform(NamedTuple):
+    """Uniform solid in 2D: centroid (d,), m, and squared radius of gyration about it, m^2."""
+
+    centroid: NDArray[np.float64]
+    gyration: float
 
 
 def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -194,6 +201,20 @@ class Convex:
     def moved(self, by: NDArray[np.float64]) -> Convex:
         """Return the shape, moved by a vector (d,), m."""
         return replace(self, corners=np.asarray(self.corners) + by)
+
+
+def uniform(shape: Ball | Convex) -> Uniform:
+    """Return a disc or polygon as a uniform solid, a polygon from the triangles between its edges and one corner."""
+    if isinstance(shape, Ball):
+        return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
+    hull = ConvexHull(np.asarray(shape.corners, dtype=float))
+    x = hull.points[hull.vertices]
+    a, b = (x - x[0])[1:-1], (x - x[0])[2:]
+    area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+    share = area / area.sum()
+    centroid = share @ (a + b) / 3
+    second = share @ (a**2 + b**2 + a * b).sum(axis=1) / 6
+    return Uniform(x[0] + centroid, float(second - centroid @ centroid))
 
 
 @dataclass(frozen=True, eq=False)

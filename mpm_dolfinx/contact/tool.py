@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
@@ -12,7 +12,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
-from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Cone, Convex, Distance, HalfSpace, Shape, unit_vector
+from mpm_dolfinx.contact.shapes import (
+    ROUNDED,
+    Ball,
+    Cone,
+    Convex,
+    Distance,
+    HalfSpace,
+    Shape,
+    Uniform,
+    uniform,
+    unit_vector,
+)
 from mpm_dolfinx.grid.grid import Grid
 
 ONTO = 100  # largest number of projections onto the surface
@@ -34,6 +45,24 @@ class Pose(NamedTuple):
         """Return the present positions of places y (m, d) in the frame of the tool."""
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
+    def gone(self, way: NDArray[np.float64]) -> Pose:
+        """Return the pose after a displacement, m, which a rotation about the centre may follow, rad."""
+        d = len(self.R)
+        R = turned(way[d]) @ self.R if way[d:].any() else self.R
+        return Pose(R, self.centre, self.shift + way[:d])
+
+
+def turned(angle: float) -> NDArray[np.float64]:
+    """Return the matrix (2, 2) of a rotation by an angle, rad."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def gone(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
+    """Return the displacement of a tool by forces from an outcome, m, followed by a rotation by forces, rad."""
+    rotation = outcome.get("tool_rotation", {})
+    way = outcome["tool_travel"][name]
+    return np.append(way, rotation[name]) if name in rotation else way
+
 
 @dataclass(frozen=True, eq=False)
 class Tool:
@@ -51,7 +80,8 @@ class Tool:
     rotation_rad : float or callable t (s) -> float, rad
         In 2D: counterclockwise rotation about `centre`, before the displacement.
     centre : (d,), m
-        Centre of rotation and reference of moments; by default the origin.  It moves with the tool.
+        Centre of rotation and reference of moments, of a free tool its centre of mass.  It moves with the tool.  By
+        default the origin, of a free disc or polygon its centroid.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
@@ -65,10 +95,16 @@ class Tool:
         Direction of the load; of any length; in axisymmetry along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
-        move it from `displacement`, along `direction` if given, else in any direction.  It does not rotate.  Results
-        are `tool_travel` (d,), m, and the velocity `outcome("tool_velocity")` (d,), m/s.
+        move it from `displacement`, along `direction` if given, else in any direction.  Results are `tool_travel` (d,),
+        m, and the velocity `outcome("tool_velocity")` (d,), m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
+    moment
+        Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; in 2D.  By default that of
+        a uniform disc or polygon.  A tool with `direction` or of another shape then does not rotate (infinity).
+        Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+    spin
+        Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
         Name of its results, and of its pressure on points, NAME_pressure; by default "tool".  A tool of the same name
         in a later stage keeps this pressure.
@@ -89,6 +125,8 @@ class Tool:
     direction: ArrayLike | None = None
     mass: float | None = None
     velocity: ArrayLike | None = None
+    moment: float | None = None
+    spin: float = 0.0
     name: str | None = field(default=None, kw_only=True, repr=False)
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
     _moved: ClassVar[Shape | None] = None
@@ -114,10 +152,14 @@ class Tool:
     def _check_free(self) -> None:
         """Raise an error for an invalid mass, and for arguments that depend on it."""
         if self.mass is None:
-            if self.velocity is not None:
-                raise ValueError(f"{line(self)}: velocity, must be given with a mass")
+            of_free = {"velocity": self.velocity is None, "moment": self.moment is None, "spin": self.spin == 0}
+            for name in [name for name, absent in of_free.items() if not absent][:1]:
+                raise ValueError(f"{line(self)}: {name}, must be given with a mass")
             return
         numbers("Tool: mass", self.mass, test=lambda v: (v > 0) & (v < np.inf), allowed="> 0 and finite")
+        numbers("Tool: spin", self.spin)
+        if self.moment is not None:
+            numbers("Tool: moment", self.moment, test=lambda v: v > 0, allowed="> 0, or infinity")
         if callable(self.displacement) or callable(self.rotation_rad):
             raise ValueError(
                 f"{line(self)}: a free tool moves by itself, displacement and rotation_rad must be constant"
@@ -141,6 +183,21 @@ class Tool:
         """Return the projection (d, d) on the directions in which a free tool may move."""
         along = self.along(dim)
         return np.eye(dim) if self.direction is None else np.outer(along, along)
+
+    def _uniform(self, dim: int) -> Uniform | None:
+        """Return a free disc or polygon as a uniform solid, None for other tools."""
+        return uniform(self.shape) if self.free and dim == 2 and isinstance(self.shape, (Ball, Convex)) else None
+
+    def inertia(self, dim: int) -> float:
+        """Return the moment of inertia about the centre, kg m^2, infinity for a tool that does not rotate."""
+        if self.moment is not None:
+            return float(self.moment)
+        of = self._uniform(dim)
+        return np.inf if of is None or self.direction is not None else self.mass * of.gyration
+
+    def turns(self, dim: int) -> bool:
+        """Whether forces rotate the tool."""
+        return self.free and np.isfinite(self.inertia(dim))
 
     def pushes(self, t: float) -> float:
         """Return the load at time t (s), N; nan without a load."""
@@ -193,22 +250,41 @@ class Tool:
         self._centre(dim)
         self.along(dim)
         self.begins(dim)
+        self._check_turns(dim)
+
+    def _check_turns(self, dim: int) -> None:
+        """Raise an error for an invalid rotation of a free tool."""
+        of, turns = self._uniform(dim), self.turns(dim)
+        if dim == 3 and turns:
+            raise ValueError(f"{line(self)}: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")
+        if self.spin and not turns:
+            raise ValueError(f"{line(self)}: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
+        if not turns:
+            return
+        if self.centre is None and of is None:
+            raise ValueError(f"{line(self)}: moment, must be given with the centre of this shape")
+        if self.moment is None and not np.allclose(self._centre(dim) + self._base, of.centroid, atol=ROUNDED):
+            raise ValueError(f"{line(self)}: centre, must be the centroid {of.centroid}, or be given with a moment")
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:
-            return np.zeros(dim) - self._base
+            of = self._uniform(dim)
+            return (np.zeros(dim) if of is None else of.centroid) - self._base
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, way: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at time t (s) after an additional displacement by forces, m, a vector for a free tool."""
+        """Return the pose at time t (s) after an additional displacement by forces, m.
+
+        way: for a free tool a vector, followed by its rotation, rad.
+        """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
         R, angle = np.eye(dim), float(self._given("rotation_rad", t))
         if angle:
-            R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            R = turned(angle)
         gone = way if np.ndim(way) else way * self.along(dim)
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + gone)
+        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).gone(gone)
 
     def drawn(self, grid: Grid, t: float, way: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid's cells inside the tool at time t (s), for pictures.

@@ -27,7 +27,7 @@ from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import Pushes
-from mpm_dolfinx.contact.tool import Pose, Tool
+from mpm_dolfinx.contact.tool import Pose, Tool, turned
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
@@ -46,8 +46,16 @@ def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
+def ways_of(dim: int) -> int:
+    """Return the number q of motions of a free tool: displacements, and in 2D a rotation."""
+    return dim + (dim == 2)
+
+
 class Ways(NamedTuple):
-    """Displacements of tools by loads (k,), m, at the start and the end of a step, with both times, s."""
+    """Displacements of tools by loads (k,), m, at the start and the end of a step, with both times, s.
+
+    With free tools (k, q): displacements and rotations.
+    """
 
     start: float
     end: float
@@ -97,6 +105,8 @@ class Tools:
                 raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
             if grid.axisymmetric and tool.begins(grid.dim)[0]:
                 raise ValueError(f"Tool: velocity = {line(tool.velocity)}, must be along the axis in axisymmetry")
+            if grid.axisymmetric and tool.free and (tool.spin or np.isfinite(tool.moment or np.inf)):
+                raise ValueError(f"{line(tool)}: spin and moment, must be left out in axisymmetry")
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
@@ -117,20 +127,35 @@ class Tools:
 
     @property
     def masses(self) -> NDArray[np.float64]:
-        """Masses (tools,), kg, 0 for tools that are not free."""
-        return np.array([tool.mass or 0.0 for tool in self.tools])
+        """Masses (tools, q), kg, and moments of inertia, kg m^2, of free tools; 0 for others."""
+        d = self.grid.dim
+        out = np.array([np.full(ways_of(d), tool.mass or 0.0) for tool in self.tools])
+        for row, tool in zip(out, self.tools, strict=True):
+            if tool.turns(d):
+                row[d:] = tool.inertia(d)
+        return out
 
     @property
     def guides(self) -> NDArray[np.float64]:
-        """Projections (tools, d, d) on the directions of free tools, in axisymmetry along the axis."""
+        """Projections (tools, q, q) on the motions of free tools, in axisymmetry along the axis."""
         d = self.grid.dim
-        out = np.array([tool.guide(d) * tool.free for tool in self.tools])
-        return out * (np.arange(d) > 0)[:, None] if self.grid.axisymmetric else out
+        out = np.zeros((len(self.tools), ways_of(d), ways_of(d)))
+        out[:, d:, d:] = np.reshape(self.turning, (-1, 1, 1))
+        for one, tool in zip(out, self.tools, strict=True):
+            one[:d, :d] = tool.guide(d) * tool.free * (np.arange(d) >= self.grid.axisymmetric)[:, None]
+        return out
+
+    @property
+    def turning(self) -> list[bool]:
+        """Which free tools rotate."""
+        return [tool.turns(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
 
     def pushes(self, t: float) -> NDArray[np.float64]:
-        """Return the loads (tools, d), N, on free tools at time t (s)."""
+        """Return the loads (tools, q), N, on free tools at time t (s), and no torques."""
         d = self.grid.dim
-        return np.array([np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools])
+        out = np.zeros((len(self.tools), ways_of(d)))
+        out[:, :d] = [np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools]
+        return out
 
     def going(self, ways: Ways, end: float | None = None) -> Tools:
         """Return the tools with their displacements by loads in a step; end: of a step with inertia, s."""
@@ -157,8 +182,7 @@ class Tools:
             return pose._replace(shift=shift)
         turns = [of.R @ before.R.T for of in (pose, end)]
         angle = in_step(share, 0.0, *(np.arctan2(turn[1, 0], turn[0, 0]) for turn in turns))
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return pose._replace(shift=shift, R=turn @ before.R)
+        return pose._replace(shift=shift, R=turned(angle) @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
         """Return the pose of a tool at time t (s); ValueError for invalid motion in axisymmetry."""

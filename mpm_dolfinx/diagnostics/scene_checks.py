@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.parts import parts_of_cells
+from mpm_dolfinx.points.active import ActiveSet
 
 
 def check_held(
     grid: Grid,
-    active: NDArray[np.bool_],
+    active: ActiveSet,
     free: NDArray[np.bool_],
     holds: Sequence[tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]],
     each: bool,
@@ -27,7 +27,7 @@ def check_held(
 
     Parameters
     ----------
-    active : (cells,)
+    active
         Cells of this process that contain a cut subdomain.
     free : (nodes, d)
         Displacement components that no wall fixes.
@@ -42,8 +42,8 @@ def check_held(
     ValueError
         With the place of the part and its number of free rigid-body modes.
     """
-    part, count = parts_of_cells(grid, active) if each else (active.astype(np.int64), 1)
-    cells = np.flatnonzero(active)
+    part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)
+    cells = active.cells
     centre, size = _extents(grid, cells, part[cells] - 1, count)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
     row, axis = np.nonzero(~free[nodes])
@@ -76,7 +76,7 @@ def check_held(
             break
     for k in range(1, count + 1):
         if missing[k - 1]:
-            places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
+            places = [p for p in grid.comm.allgather(grid.midpoints[part == k][:1].tolist()) if p]
             where = (
                 f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0] + grid.base)}]" if count > 1 else "the body"
             )

@@ -36,7 +36,7 @@ def followed(
     filled : (cells,)
         Which local cells contain material.  Nodes beyond an empty cell may belong to another body.
     """
-    used = np.flatnonzero(np.bincount(cells, minlength=1))
+    used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
     slot[used] = np.arange(len(used))
     field = grid.over_edges(grid.monomials @ _at(u, grid.cell_nodes[used]), used)
@@ -96,7 +96,7 @@ def _second_differences(
         for k, (end, value) in enumerate(((low, first), (high, last))):
             local = neighbours[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
-            known.append(np.broadcast_to((local >= 0) & filled[local], (2 ** (d - 1), len(local))))
+            known.append((local >= 0) & filled[local])
             if grid.even:
                 ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
             else:  # h^2 times the divided difference
@@ -108,7 +108,7 @@ def _second_differences(
         across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # equal at both ends
         bend = (across[:, low] + across[:, high]) @ bend
         if not grid.even:  # for offsets in m
-            rows = np.flatnonzero(np.arange(2**d) >> a & 1 == 0)
+            rows = (np.arange(2**d) >> a & 1 == 0).nonzero()[0]
             whole = np.zeros((d, 2**d, len(cells)))
             whole[:, rows] = bend
             bend = grid.over_edges(whole, cells)[:, rows]

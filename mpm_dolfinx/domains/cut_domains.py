@@ -198,20 +198,20 @@ class CutDomains(Keyed):
             number, xi = np.concatenate([number, renewed.face]), np.concatenate([xi, renewed.xi])
         corners = self.points.corners[at]
         count = xi.shape[1]
-        places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
+        places = interpolate(corners.repeat(count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
         outward = face_vectors(corners, number)
         size = np.linalg.norm(outward, axis=1, keepdims=True)
-        skew = np.flatnonzero(skew[here][face])  # xi is linear over a triangle, and places are not in xi
+        skew = skew[here][face].nonzero()[0]  # xi is linear over a triangle, and places are not in xi
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
         inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
-        surface = np.repeat(np.arange(len(several)), list(map(len, several)))[here][face]
+        surface = np.arange(len(several)).repeat(list(map(len, several)))[here][face]
         out = []
         for k, faces in enumerate(several):
-            own = np.flatnonzero(surface == k)
+            own = (surface == k).nonzero()[0]
             anew = renewed and renewed.of(face[own] - (len(here) - len(renewed.row)))
             out.append(Patches(self.grid, faces, *(v[own] for v in rows), anew))
         return out
@@ -235,7 +235,7 @@ class CutDomains(Keyed):
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim
-        at = np.repeat(np.arange(n), 2**d if self.domains else 1)
+        at = np.arange(n).repeat(2**d if self.domains else 1)
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # rounding must not assign a corner on a grid line to a cell outside the domain
         cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
@@ -262,7 +262,7 @@ class CutDomains(Keyed):
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         if not len(key):
             return cell
-        found = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        found = np.minimum(keys.searchsorted(key), len(keys) - 1)
         empty = keys[found] != key
         if empty.any():
             cell[empty] = pieces.cell[self._largest()[at[empty]]]

@@ -48,12 +48,12 @@ class Neighbours:
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):
         starts = np.cumsum([0, *map(len, bodies)])
-        self.rows = rows = np.flatnonzero(chosen & (ids < starts[-1]))
+        self.rows = rows = (chosen & (ids < starts[-1])).nonzero()[0]
         """The points (k,) with neighbours."""
         dim = bodies[0].dim
         of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.int64)
         for i, body in enumerate(bodies):
-            chosen_rows = np.flatnonzero(of == i)
+            chosen_rows = (of == i).nonzero()[0]
             corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
             # equal for both sides of a face: its lowest corner, and the one diagonally opposite
             first = corners.argmin(axis=2)[:, :, None]
@@ -61,11 +61,11 @@ class Neighbours:
             key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
         key = key.ravel()
         partner = _pairs(key)
-        self._unpaired = np.flatnonzero(partner < 0)
+        self._unpaired = (partner < 0).nonzero()[0]
         self._exchange = Exchange(comm, (key[self._unpaired] % comm.size).astype(np.int32))
         self._partners = _pairs(self._exchange.send(key[self._unpaired]))
         found = self._exchange.back(self._partners >= 0)
-        partner[self._unpaired[found]] = len(key) + np.flatnonzero(found)
+        partner[self._unpaired[found]] = len(key) + found.nonzero()[0]
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face, -1 without
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
@@ -74,7 +74,7 @@ class Neighbours:
         own (c, k): columns of these points; faces: centres (d, k), m, of each of their faces.
         """
         centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
-        point = np.repeat(np.arange(own.shape[1]), len(faces))
+        point = np.arange(own.shape[1]).repeat(len(faces))
         if self._exchange.comm.size > 1:
             rows = np.concatenate([own[:, point[self._unpaired]], centres[:, self._unpaired]])
             away = self._exchange.back(self._exchange.send(rows.T.copy())[self._partners]).T
@@ -117,8 +117,8 @@ class LinearGradients:
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index (n,) of the other entry with the same key, -1 without."""
-    order, out = np.argsort(key, kind="stable"), np.full(len(key), -1)
-    same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
+    order, out = key.argsort(kind="stable"), np.full(len(key), -1)
+    same = (key[order[1:]] == key[order[:-1]]).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]
     return out
 
@@ -146,7 +146,7 @@ def linear_gradients(
     slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, soils)
     offset = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
     xi = [sum(inverse[a, b][of] * x for b, x in enumerate(offset)) for a in range(d)]
-    J, cofactors = determinant(F), np.moveaxis(cofactor(F), 0, 2).swapaxes(0, 1)
+    J, cofactors = determinant(F), cofactor(F).transpose(1, 2, 0).swapaxes(0, 1)
     e = np.einsum("ijn,ajkn->aikn", cofactors / J, slope)
     ratio = np.trace(e, axis1=1, axis2=2)
     # the mean is weighted by volumes at rest; the second-order part would change the domain's volume, so it is removed
@@ -155,10 +155,10 @@ def linear_gradients(
         variance = sum_by(of, fraction * xi[a] * xi[b], len(F))
         shift += variance * ratio[b] * slope[a]
         second += 0.5 * variance * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
-    base = np.moveaxis(F, 0, 2)
+    base = F.transpose(1, 2, 0)
     base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
     out = base[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
-    out = np.ascontiguousarray(np.moveaxis(out, 2, 0))
+    out = np.ascontiguousarray(out.transpose(2, 0, 1))
     ratios = determinant(out)
     if (inverted := ratios <= 0).any():  # their domains keep one gradient
         even = np.isin(of, of[inverted])
@@ -173,11 +173,11 @@ def _slopes(
     """Return slopes (d, k, k, r) of F by the coordinates xi of domains, and their inverse edges (d, d, r), 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
-    corners, bits = np.moveaxis(cut.points.corners[rows], 0, 2).copy(), corner_bits(d)
-    faces = [corners[bits[:, a] == end].mean(axis=0) for a in range(d) for end in (0, 1)]
-    edges = np.stack([faces[2 * a + 1] - faces[2 * a] for a in range(d)], axis=1)
+    corners, bits = cut.points.corners[rows].transpose(1, 2, 0).copy(), corner_bits(d)
+    faces = [corners[bits[:, a] == end].sum(axis=0) / 2 ** (d - 1) for a in range(d) for end in (0, 1)]
+    edges = np.array([faces[2 * a + 1] - faces[2 * a] for a in range(d)]).swapaxes(0, 1)
     inverse = _inverse(edges)
-    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.mean(axis=0), soils[rows].T])
+    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.sum(axis=0) / 2**d, soils[rows].T])
     others = neighbours.at_neighbours(own, faces)
     nearest = NEAR * np.abs(edges).sum(axis=0).min(axis=0)
     A, B = np.zeros((d, d, len(rows))), np.zeros((d, k * k, len(rows)))
@@ -200,5 +200,5 @@ def _slopes(
 
 def _inverse(A: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the inverses of matrices (d, d, n)."""
-    A = np.moveaxis(A, 2, 0)
-    return np.moveaxis(cofactor(A).transpose(0, 2, 1) / determinant(A)[:, None, None], 0, 2).copy()
+    A = A.transpose(2, 0, 1)
+    return (cofactor(A).transpose(0, 2, 1) / determinant(A)[:, None, None]).transpose(1, 2, 0).copy()

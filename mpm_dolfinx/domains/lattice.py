@@ -88,7 +88,7 @@ class Lattice:
 
     def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the indices of the body's points."""
-        return np.flatnonzero((points.id >= self._start) & (points.id < self._stop))
+        return ((points.id >= self._start) & (points.id < self._stop)).nonzero()[0]
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
@@ -149,11 +149,11 @@ def _change(
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
-    rank = np.searchsorted(starts, layer, side="right") - 1
+    rank = starts.searchsorted(layer, side="right") - 1
     exchange = Exchange(comm, rank)
     rows = [(exchange.send(number), exchange.send(values))]
     for other in range(-MARGIN, MARGIN + 1) if comm.size > 1 else ():  # a slab may be one layer thin
-        to = np.clip(rank + other, 0, comm.size - 1)
+        to = np.minimum(np.maximum(rank + other, 0), comm.size - 1)
         near = (to != rank) & (to == rank + other) & (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
         halo = Exchange(comm, to[near])
         rows.append((halo.send(number[near]), halo.send(values[near])))
@@ -170,7 +170,8 @@ def _change(
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
-    change = np.nan_to_num(_filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1])
+    change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
+    change[np.isnan(change)] = 0.0
     return exchange.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
 
 
@@ -210,14 +211,10 @@ def _along(
 ) -> NDArray[np.float64]:
     """Return a box (..., k) of values after the filter along one axis; weights: see `_divided`, None for equal rows."""
     out, count = d.copy(), d.shape[axis]
-    along, cells = np.moveaxis(out, axis, 0), np.moveaxis(crossed, axis, 0)
+    along, cells = out.swapaxes(axis, 0), crossed.swapaxes(axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
-    if weights is None:
-        factors, third = THIRD, np.diff(along, 3, axis=0)
-    else:
-        factors = weights.reshape(len(THIRD), -1, *(1,) * (along.ndim - 1))
-        third = sum(factor * along[k : count - 3 + k] for k, factor in enumerate(factors))
-    third = share / 64 * third
+    factors = THIRD if weights is None else weights.reshape(len(THIRD), -1, *(1,) * (along.ndim - 1))
+    third = share / 64 * sum([factor * along[k : count - 3 + k] for k, factor in enumerate(factors)])
     third[np.isnan(third)] = 0.0
     for k, factor in enumerate(factors):
         along[k : count - 3 + k] -= factor * third

@@ -157,20 +157,13 @@ class Reconstruction:
         All (n, d, 2), by axis and end; zero without a neighbour or drained side.
         """
         cells, p, centroid, faces, outer = pressures
-        neighbours = self._neighbour[cells]
-        own = p[cells]
-        jump, one_sided = np.zeros(neighbours.shape), np.zeros(neighbours.shape)
-        is_open = np.zeros(neighbours.shape, dtype=bool)
-        for axis in range(self.grid.dim):
-            for end in (0, 1):
-                other, sign = neighbours[:, axis, end], 2 * end - 1
-                is_open[:, axis, end] = inside = (
-                    (other >= 0) & (faces[cells, axis, end] > 0) & (faces[other, axis, 1 - end] > 0)
-                )
-                jump[:, axis, end] = np.where(inside, p[other] - own, 0.0)
-                distance = self.grid.between(cells, other, axis)
-                distance = distance + sign * (centroid[other, axis] - centroid[cells, axis])
-                one_sided[:, axis, end] = sign * jump[:, axis, end] / np.where(inside, distance, 1.0)
+        neighbours, own = self._neighbour[cells], cells[:, None, None]
+        axis, end = np.arange(self.grid.dim)[:, None], np.arange(2)
+        sign = 2 * end - 1
+        is_open = (neighbours >= 0) & (faces[cells] > 0) & (faces[neighbours, axis, 1 - end] > 0)
+        jump = np.where(is_open, p[neighbours] - p[own], 0.0)
+        distance = self.grid.between(own, neighbours, axis) + sign * (centroid[neighbours, axis] - centroid[own, axis])
+        one_sided = sign * jump / np.where(is_open, distance, 1.0)
         drained = ~is_open & np.isfinite(outer[..., 0])
         jump, one_sided = np.where(drained, outer[..., 0], jump), np.where(drained, outer[..., 1], one_sided)
         return jump, one_sided, is_open, drained
@@ -227,14 +220,14 @@ def share_within(
 ) -> NDArray[np.float64]:
     """Return the largest factors (n,) by which all rises (m,) in a cell stay between its low and high (n,)."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
-    excessive = np.flatnonzero(np.abs(increment) > np.abs(bound))
+    excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
     return share
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the smallest difference, <= 0, and the largest, >= 0, to neighbours (n,), of differences (n, d, 2)."""
-    return jump.min(axis=(1, 2)).clip(max=0), jump.max(axis=(1, 2)).clip(min=0)
+    return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
@@ -242,11 +235,11 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     n = len(points)
     if not n:
         return np.empty(0)
-    owner = np.searchsorted(points.id, old.id)
+    owner = points.id.searchsorted(old.id)
     cells = 2 + max(old.cell.max(initial=-1), new.cell.max(initial=-1))
     old_key, new_key = owner * cells + old.cell + 1, new.point * cells + new.cell + 1
-    at = np.minimum(np.searchsorted(old_key, new_key), max(len(old_key) - 1, 0))
-    match = np.flatnonzero(old_key[at] == new_key)
+    at = np.minimum(old_key.searchsorted(new_key), max(len(old_key) - 1, 0))
+    match = (old_key[at] == new_key).nonzero()[0]
     before = at[match]
 
     common = np.zeros(len(new_key))
@@ -275,8 +268,8 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
     """Return the factor (m,) of a correction, equal for all pieces of a domain, that respects the bounds."""
-    first = np.flatnonzero(np.diff(owner, prepend=-1))
+    first = np.diff(owner, prepend=-1).nonzero()[0]
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
     share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0).clip(0, 1)
-    return np.minimum.reduceat(share, np.flatnonzero(np.diff(new.point, prepend=-1)))[new.point]
+    return np.minimum.reduceat(share, np.diff(new.point, prepend=-1).nonzero()[0])[new.point]

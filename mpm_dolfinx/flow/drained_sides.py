@@ -107,8 +107,11 @@ class DrainedSides(Feeding):
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
             given, n = everywhere(grid, partial(outlet.through, wet.t, on_side(p, wet.points))), len(p.x)
-            columns = [np.resize(column, (n, 1)) for column in (i, *given)]
-            rows.append((p.cell, p.x, np.concatenate([*columns, p.area(wet.points)], axis=1)))
+            columns = np.empty((n, 5 + grid.dim))
+            for k, column in enumerate((i, *given)):
+                columns[:, k] = column
+            columns[:, 5:] = p.area(wet.points)
+            rows.append((p.cell, p.x, columns))
         cell, x, values = gathered(grid, rows, 5 + grid.dim)
         number = values[:, 0].astype(np.int64)
         pressure, flux, one_way, driest = values[:, 1:5].T
@@ -221,14 +224,17 @@ class RainedFaces(OpenFaces):
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
         ponded = self.pond.outflow(fluid)
-        return np.where(np.isnan(self.rain), ponded, np.clip(-self.rain, ponded, self.dry.outflow(fluid)))
+        return np.where(
+            np.isnan(self.rain), ponded, np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
+        )
 
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction; zero on faces with rain."""
-        both = self.pond.nonorthogonal(fluid, difference)
-        return tuple(np.where(np.isnan(self.rain), values, 0.0) for values in both)
+        return tuple(
+            np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
+        )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,) by forces of inertia, m^d/s; zero on faces with rain."""
@@ -325,9 +331,9 @@ class SideFeeds(Feeds):
         flux, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
-        turnover = sum_by(at.at, counts * at.open_by(fluid), len(fluid.pi)) * np.abs(fluid.pi)
-        gain = sum_by(at.at, np.abs(flux), len(fluid.pi)) if self._drain else 0.0  # steady rain changes nothing
-        return Leaving(sum_by(at.at, flux, len(fluid.pi)), turnover, gain)
+        rows = np.array([flux, counts * at.open_by(fluid), np.abs(flux) * self._drain])
+        cells, turnover, gain = sum_by(at.at, rows, len(fluid.pi))
+        return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # steady rain changes nothing: it has no gain
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow."""

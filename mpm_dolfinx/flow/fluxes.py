@@ -26,8 +26,8 @@ from mpm_dolfinx.base.fluid_content import density_between, mass_potential
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
-from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
+from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
 ALONG = 0.1  # component of a unit normal: sides with less do not determine the pressure's slope along that axis
@@ -82,11 +82,11 @@ class Conduction:
     def along(self, dim: int) -> NDArray[np.float64]:
         """Return the mobilities (n, d) along the axes, pulled back: `across` for all unit vectors."""
         kappa, share = self.mobility.mean[:, None], self.mobility.share
-        kappa = np.repeat(kappa, dim, axis=1) if share is None else kappa * share
+        kappa = kappa.repeat(dim, axis=1) if share is None else kappa * share
         if self.motion is None:
             return kappa
         (cofactors, ratio), hoop = self._cofactors, self.motion.hoop
-        along = kappa / ratio[:, None] * (cofactors**2).sum(axis=1)
+        along = kappa / ratio[:, None] * np.add.reduce(cofactors**2, axis=1)
         return along if hoop is None else along * hoop[:, None]
 
     def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,8 +97,8 @@ class Conduction:
         if self.motion is None:
             return kappa
         (cofactors, ratio), hoop = self._cofactors, self.motion.hoop
-        pulled = np.einsum("mij,mj->mi", cofactors[at], normal)
-        across = kappa / ratio[at] * (pulled**2).sum(axis=1)
+        pulled = cofactors[at] @ normal[:, :, None]
+        across = kappa / ratio[at] * np.add.reduce(pulled**2, axis=(1, 2))
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
@@ -114,7 +114,7 @@ class Conduction:
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the deformed vectors (m, d), m, in cells `at`."""
-        return vector if self.motion is None else np.einsum("mij,mj->mi", self.motion.F[at], vector)
+        return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 
 @dataclass(frozen=True)
@@ -182,18 +182,24 @@ class OpenSides:
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.einsum("md,md->m", self.offset, self.normal)
         # prescribed inflows have no conductance; closed seepage faces have no pressure
-        drained = np.flatnonzero((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure)))
+        drained = ((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure))).nonzero()[0]
         at = at[drained]
         normal = self.normal[drained]
         distance = distance[drained]
         area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
-        for axis, end in np.ndindex(out.shape[1:3]):
-            cosine = (2 * end - 1) * normal[:, axis]
-            share = np.where(cosine > ALONG, area * cosine, 0.0)
-            total = sum_by(at, share, len(p))
-            # the pressure is constant along the side, so its gradient is normal to it
-            for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
-                np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
+        cosine = normal[:, :, None] * [-1, 1]
+        share = np.where(cosine > ALONG, area[:, None, None] * cosine, 0.0)
+        ends = 2 * out.shape[1]
+        slots = (ends * at[:, None] + np.arange(ends)).ravel()
+
+        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            """Return the sums of values by cell, axis and end."""
+            return sum_by(slots, values.ravel(), ends * len(p)).reshape(out.shape[:3])
+
+        whole = total(share)
+        # the pressure is constant along the side, so its gradient is normal to it
+        for k, values in enumerate((jump[:, None], (jump / distance)[:, None] * normal)):
+            np.divide(total(share * values[:, :, None]), whole, out=out[..., k], where=whole > 0)
         return out
 
 
@@ -230,47 +236,44 @@ class CellContents(Keyed):
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
         self.grid = grid = forms.grid
-        self.active = active = forms.active.cells
+        self.active = active = forms.active.now.cells
         """Owned active cells and active ghosts."""
-        self.filled = filled
+        self.filled, self._nodes = filled, grid.cell_nodes[filled]
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
-        self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
-        self.volume = self.total(cells, weight)
-        """Volumes (n,) of material in the filled cells, m^d."""
-        self.area, area = pieces.area, self.total(cells, pieces.area)
-        """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
+        self.weight, self.area = pieces.weight, pieces.area
+        """Of the pieces (m,): volume, m^d, and the same in axisymmetry in the plane, m^2."""
+        self._at, d = self._slot[pieces.cells], grid.dim
+        rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
+        sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), -1).T]))
+        self.volume, area, self.fixed_stress = sums[:3]
+        """Volumes (n,) of material in the filled cells, m^d, and the fixed-stress coefficient times volume."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fraction of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
-        self.fixed_stress = self.total(cells, weight * pieces.fixed_stress)
-        """Fixed-stress coefficient times volume (n,) of the filled cells."""
         forms.fixed_stress.x.array[filled] = self.fixed_stress
-        centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
-        h, volume = grid.sizes(filled).T, grid.volumes(filled)
-        for a in range(grid.dim):
-            mean = self.total(cells, pieces.area * pieces.x[:, a]) / area
-            centroid[filled, a] = mean - grid.midpoints[filled, a]
-            for target, end in ((lower, 0), (upper, 1)):
-                target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * h[a] / volume
+        centroid, lower, upper = (f.x.array.reshape(-1, d) for f in shapes)
+        centroid[filled] = (sums[3 : 3 + d] / area).T - grid.midpoints[filled]
+        for target, faces in ((lower, sums[3 + d :: 2]), (upper, sums[4 + d :: 2])):
+            target[filled] = faces.T * grid.sizes(filled) / np.reshape(grid.volumes(filled), (-1, 1))
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
-        self._slopes = grid.shape_gradients(filled, grid.midpoints[filled] + centroid[filled])
-        self._values = grid.shape_values(filled, grid.midpoints[filled] + centroid[filled])
+        at = grid.midpoints[filled] + centroid[filled]
+        self._shapes = np.dstack([grid.shape_gradients(filled, at), grid.shape_values(filled, at)])
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active] = np.stack([lower[active], upper[active]], axis=2)
         """Centroids (c, d) of the material in cells, from their midpoints, m; open fractions of faces (c, d, 2)."""
 
-    def total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum values over the rows of each filled cell."""
-        return sum_by(self._slot[cells], values, len(self.filled))
+    def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
+        return sum_by(self._at, values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the softness of the filled cells: the largest softness (m,) of their pieces."""
         softest = np.ones(len(self.filled))
-        np.maximum.at(softest, self._slot[self._cells], softness)
+        np.maximum.at(softest, self._at, softness)
         return softest
 
     def set_damping(
@@ -287,25 +290,21 @@ class CellContents(Keyed):
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means over the pieces (m,) of each filled cell."""
-        return self.total(self._cells, self.weight * values) / self.volume
+        return self.total(self.weight * values) / self.volume
 
     def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return u (nodes, d) at the nodes of the filled cells (n, d, 2^d)."""
         return u[self._nodes].transpose(0, 2, 1)
 
-    @cached_property
-    def _nodes(self) -> NDArray[np.int32]:
-        return self.grid.cell_nodes[self.filled]
-
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
         """Return the motion of filled cells at their centroids by `nodal` displacements, m; rests: cells at rest."""
-        hoop = None
-        moved = np.einsum("ndk,nk->nd", nodal, self._values)
+        hoop, d = None, self.grid.dim
+        at_centroids = nodal @ self._shapes
+        F, moved = np.eye(d) + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
-        F = np.eye(self.grid.dim) + nodal @ self._slopes
         if rests is not None:
-            F[rests], moved[rests] = np.eye(self.grid.dim), 0.0
+            F[rests], moved[rests] = np.eye(d), 0.0
             if hoop is not None:
                 hoop[rests] = 1.0
         return CellMotion(F, moved, hoop)
@@ -313,7 +312,7 @@ class CellContents(Keyed):
     @property
     def shape_values(self) -> NDArray[np.float64]:
         """Values (n, 2^d) of the shape functions at the centroids of the material in filled cells."""
-        return self._values
+        return self._shapes[:, :, -1]
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the indices of cells among the filled ones."""
@@ -415,8 +414,10 @@ class FluxForms:
         along = off - ufl.dot(off, n0) * n0
         self.nonorthogonal = None
         if flows and not grid.axisymmetric:
-            flux = -T * ufl.avg(self.density) * ufl.dot(ufl.avg(self.slope), along)
-            self.nonorthogonal = FacetForm(flux * ufl.jump(q) * dS, grid.comm)
+            conductance = T * ufl.avg(self.density)
+            self.nonorthogonal = FacetForm(
+                -conductance * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm
+            )
         self.gravity = None
         if (weight is not None or relative is not None) and flows:
             # water at rest stays at rest: its pressure grows by its weight at zero pressure.  Both are in one form, so
@@ -470,13 +471,13 @@ class FluxForms:
         mobility = flow.along(d)
         if self.relative is not None:
             self.relative.set_shares(filled, flow.mobility.shares)
-        values = {self.mobility: mobility}
+        values = [(self.mobility, mobility)]
         if shift is not None:  # the fluid's weight still refers to the centroids
-            values[self.centroid] = contents.centroid[filled] + shift
+            values.append((self.centroid, contents.centroid[filled] + shift))
         if self.gravity:
             moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
-            values[self.moved] = moved if shift is None else moved - shift
-        for f, rows in values.items():
+            values.append((self.moved, moved if shift is None else moved - shift))
+        for f, rows in values:
             f.x.array.reshape(-1, d)[filled] = rows
             f.x.scatter_forward()
         if self.relative is not None:

@@ -51,10 +51,10 @@ from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
-from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.parts import OfParts, Parts
 from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
 
@@ -138,6 +138,7 @@ class StorageForms:
         Q = self.p.function_space
         self.conductivity = conductivity
         self._work = fem.Function(Q)
+        self._sums = self._work.x.array
         q = ufl.TestFunction(Q)
         p, delta = ufl.variable(self.p), ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
@@ -169,7 +170,7 @@ class StorageForms:
 
     def change(self, data: PointData) -> NDArray[np.float64]:
         """Return the change of the fluid in the filled cells since the start of the step, m^d, in a local array."""
-        b = self._work.x.array
+        b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
         return b
@@ -181,8 +182,7 @@ class StorageForms:
         if they differ.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
-        by_p, *by_u = np.split(sums, range(1, sums.shape[1], count), axis=1)
-        return [by_p[:, 0], *by_u]
+        return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the storage of the filled cells (n,) by their saturation, m^d/Pa, and S d(chi p)/dp, m^d, at p."""
@@ -199,10 +199,10 @@ class StorageForms:
         relative, borders = self.fluxes.relative, None
         if relative is not None:
             borders = relative.set_pressures(self.p.x.array, force)
-        self._work.x.array[active] = 0.0
-        assembled.assemble_vector(self._work.x.array)
+        self._sums[active] = 0.0
+        assembled.assemble_vector(self._sums)
         if borders is not None:
-            borders.add_fluxes(self._work.x.array)
+            borders.add_fluxes(self._sums)
         return sum_ghosts(self._work)
 
 
@@ -235,7 +235,7 @@ class Rates:
 
     def integrated(self, seconds: float) -> Rates:
         """Return the outflow volumes in a time, s."""
-        return Rates(*(seconds * values for values in (self.cells, self.net, self.turnover, self.gain)))
+        return Rates(seconds * self.cells, seconds * self.net, seconds * self.turnover, seconds * self.gain)
 
 
 class StorageSystem:
@@ -414,7 +414,7 @@ class StorageProblem:
         scale: NDArray[np.float64] | None = None,
     ):
         self._scale = scale
-        self.forms = forms
+        self.forms, self._p = forms, (forms.p.x.array, forms.p_n.x.array)
         self.system = system
         self.data = data
         self._defect = defect
@@ -457,14 +457,14 @@ class StorageProblem:
     @property
     def _fluid(self) -> Fluid:
         """The fluid in the active owned cells at p."""
-        p = self.forms.p.x.array[self.system.unknowns.owned]
+        p = self._p[0][self.system.unknowns.owned]
         return Fluid(p, mass_potential(p, self.forms.bulk), np.exp(p / self.forms.bulk))
 
     @property
     def _density(self) -> NDArray[np.float64]:
         """Mid-step density of the fluid in the active owned cells, over the density at zero pressure."""
-        forms, owned = self.forms, self.system.unknowns.owned
-        return np.exp((forms.p.x.array[owned] + forms.p_n.x.array[owned]) / (2 * forms.bulk))
+        (p, p_n), owned = self._p, self.system.unknowns.owned
+        return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
     def outflows(self) -> dict[str, NDArray[np.float64]]:
         """Return the outflow from the bodies by each condition at (u, p), m^d/s, by name."""
@@ -519,7 +519,7 @@ class StorageProblem:
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
         """Start the substep of all feeds; return the non-orthogonal correction of fluxes between cells, m^d/s."""
-        p, fluid = self.forms.p.x.array, self._fluid
+        p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, difference = 0.0, np.zeros(sum(sides))
         if outflow.nonorthogonal is not None:
@@ -541,7 +541,7 @@ class StorageProblem:
 
         dp (n,): decreases by Newton's method, Pa; previous (n,): change of the logarithm in the iteration before.
         """
-        p = self.forms.p.x.array[self.system.unknowns.owned]
+        p = self._p[0][self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, previous)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
@@ -592,7 +592,7 @@ class StorageProblem:
         b[owned] = change = density * b[owned] + self._defect
         r = system.unknowns.gather(b, system.residual)
         step = system.step
-        step.array_w[:] = forms.p.x.array[owned] - forms.p_n.x.array[owned]
+        step.array_w[:] = self._p[0][owned] - self._p[1][owned]
         if self.damped:
             system.D.multAdd(step, r, r)
         if self._softer is not None:
@@ -603,8 +603,13 @@ class StorageProblem:
         r.array_w[:] = mass / density
         # bound of rounding errors: of volumes, and of fluxes that cancel
         round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
-        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.net + before.net
-        return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
+        rows = (
+            np.abs(change) + now.gain + before.gain,
+            round_off,
+            np.abs(mass),
+            change + now.net + before.net,
+        )
+        return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
@@ -614,10 +619,12 @@ class StorageProblem:
             fluid = fluid._replace(force=self._inertial())
             force = self._local(fluid.force)
         if system.gravity is None:
-            cells = system.between(fluid.pi)
+            cells = system.between(fluid.pi) + self._correction
         else:
-            cells = self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
-        cells = cells + self._correction
+            cells = (
+                self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
+                + self._correction
+            )
         net, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):

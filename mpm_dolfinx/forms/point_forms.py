@@ -115,7 +115,8 @@ class FormPoints:
         has many terms in 3D. There a kernel of Hencky's law takes at most half of the time, its compilation a fifth.
         """
         if "gradient" not in self.live:
-            self.follow("gradient", (self.grid.dim, self.grid.dim), lambda data: data.gradients(u))
+            values = u.x.array
+            self.follow("gradient", (self.grid.dim, self.grid.dim), lambda data: data.gradients(values))
         return self.functions["gradient"]
 
     def follow(self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray]) -> fem.Function:
@@ -216,14 +217,18 @@ class Places(Keyed):
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
-    def products(self, axis: int) -> list[tuple[int, NDArray[np.float64] | float]]:
-        """Return products (n,) of offsets along sets of the other axes, or means: see `Grid.monomials`."""
-        others = [a for a in range(self.grid.dim) if a != axis]
-        out = [(0, 1.0), *((1 << a, self.offset[:, a]) for a in others)]
-        if len(others) == 2:
-            mixed = 0.0 if self.mixed is None else self.mixed[:, axis]
-            out.append((sum(1 << a for a in others), self.offset[:, others].prod(axis=1) + mixed))
-        return out
+    @cached_property
+    def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
+        """For each axis products (n,) of offsets along sets of the others, or means: see `Grid.monomials`."""
+        along = []
+        for axis in range(self.grid.dim):
+            others = [a for a in range(self.grid.dim) if a != axis]
+            out = [(0, 1.0), *((1 << a, self.offset[:, a]) for a in others)]
+            if len(others) == 2:
+                mixed = 0.0 if self.mixed is None else self.mixed[:, axis]
+                out.append((sum(1 << a for a in others), self.offset[:, others].prod(axis=1) + mixed))
+            along.append(out)
+        return along
 
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m: see `FormPoints.hoop`."""
@@ -277,9 +282,9 @@ class PointData(Keyed):
         """Return the values (n, size) of a field."""
         return self._rows[name]
 
-    def gradients(self, u: fem.Function) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector function at its present values, which it keeps."""
-        nodal = u.x.array.take(self.places.nodal)
+    def gradients(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array; keeps the last ones."""
+        nodal = u.take(self.places.nodal)
         return self._gradients(nodal, lambda: self._of_nodal(nodal))
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -303,10 +308,14 @@ class PointData(Keyed):
         # one component at a time: numpy takes six times as long for rows of a few numbers
         for axis in range(d):
             along = 0.0
-            for others, product in places.products(axis):
-                along += product * np.take(of_cells[:, others | 1 << axis], places.slots, axis=1, mode="wrap")
+            for others, product in places.products[axis]:
+                along += product * of_cells[:, others | 1 << axis].take(places.slots, axis=1, mode="wrap")
             out[:, :, axis] = along.T
         return out.reshape(len(self.cells), d**2)
+
+
+Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
+"""Rows of coefficients, and for each grid function among them its columns, its values, and their dofs by rows."""
 
 
 class Rows:
@@ -322,26 +331,26 @@ class Rows:
 
     def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
         names = {f: name for name, f in points.functions.items()}
-        self._columns = []
+        self._fixed, self._changing = [], []
         self._gathered = []
         start = 0
         for f in compiled.coefficients:
             dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
-            stop = start + dofs.shape[1] * bs
-            if f in names:
-                self._columns.append((slice(start, stop), names[f]))
+            columns = slice(start, start + dofs.shape[1] * bs)
+            if f not in names:
+                self._gathered.append((columns, f.x.array, dofs, bs))
+            elif names[f] in points.live:
+                self._changing.append((columns, names[f], points.live[names[f]]))
             else:
-                self._gathered.append((slice(start, stop), f, dofs))
-            start = stop
+                self._fixed.append((columns, names[f]))
+            start = columns.stop
         self._width = start
-        self._live = {name: points.live[name] for _, name in self._columns if name in points.live}
-        self._room = Latest()
-        self._dofs = Latest()
-        self._packed = Latest()
+        self._room: Latest[NDArray[np.float64]] = Latest()
+        self._packed: Latest[Packed] = Latest()
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the present values of the form's fields that change while the points stay."""
-        return {name: values(data) for name, values in self._live.items()}
+        return {name: values(data) for _, name, values in self._changing}
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return the buffer of the rows, at least `size`; it is kept between steps, because new memory is slow."""
@@ -354,38 +363,28 @@ class Rows:
         self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
     ) -> NDArray[np.float64]:
         """Return the rows of the chosen points, the first of the memory of all; live: as `live` gives it."""
-        cells = data.cells[chosen]
-        rows = self.room(len(cells))[: len(cells)]
         if isinstance(chosen, slice):
-            key = (data.key, chosen.start)
-            dofs = self._dofs((data.places.key, chosen.start), lambda: self._dofs_of(cells))
-            self._packed(key, lambda: self._pack(rows, data, chosen))
+            key = (data.key, chosen.start) if chosen.start else data.key
+            rows, dofs = self._packed(key, lambda: self._pack(data, chosen))
         else:
             self._packed.clear()
-            dofs = self._dofs_of(cells)
-            self._pack(rows, data, chosen)
-        for columns, name in self._columns:
-            if name in live:
-                rows[:, columns] = live[name][chosen]
-        for columns, f, at in dofs:
-            rows[:, columns] = np.take(f.x.array, at, mode="wrap")  # "raise" checks every index
+            rows, dofs = self._pack(data, chosen)
+        for columns, name, _ in self._changing:
+            rows[:, columns] = live[name][chosen]
+        for columns, values, at in dofs:
+            rows[:, columns] = values.take(at, mode="wrap")  # "raise" checks every index
         return rows
 
-    def _pack(self, rows: NDArray[np.float64], data: PointData, chosen: slice | NDArray[np.int64]) -> bool:
-        """Set the columns of the fields that are constant while the points stay."""
-        for columns, name in self._columns:
-            if name not in self._live:
-                rows[:, columns] = data[name][chosen]
-        return True
-
-    def _dofs_of(self, cells: NDArray[np.int32]) -> list[tuple[slice, fem.Function, NDArray[np.intp]]]:
-        """Return columns, function and unrolled dofs of grid functions; numpy's own index type avoids copies."""
-        out = []
-        for columns, f, dofs in self._gathered:
-            bs = f.function_space.dofmap.bs
-            at = dofs[cells][:, :, None].astype(np.intp) * bs + np.arange(bs)
-            out.append((columns, f, at.reshape(len(cells), at.shape[1] * bs)))
-        return out
+    def _pack(self, data: PointData, chosen: slice | NDArray[np.int64]) -> Packed:
+        """Return the rows with the fields that are constant while the points stay, and the dofs of grid functions."""
+        cells = data.cells[chosen]
+        rows, dofs = self.room(len(cells))[: len(cells)], []
+        for columns, name in self._fixed:
+            rows[:, columns] = data[name][chosen]
+        for columns, values, of_cells, bs in self._gathered:
+            at = of_cells[cells][:, :, None].astype(np.intp) * bs + np.arange(bs)  # numpy's index type avoids copies
+            dofs.append((columns, values, at.reshape(len(cells), at.shape[1] * bs)))
+        return rows, dofs
 
 
 class PointForm:
@@ -409,9 +408,8 @@ class PointForm:
     def _parts(self, data: PointData) -> Iterator[tuple]:
         """Yield the form bound to one chunk of points after the other, with the coefficients of each chunk."""
         cells, live = data.places.slots if self._dense else data.cells, self._rows.live(data)
-        parts = in_chunks(len(cells))
-        bound = self._bound(cells, lambda: [self.compiled.bind(cells[part]) for part in parts])
-        for part, form in zip(parts, bound, strict=True):
+        bind = self.compiled.bind
+        for part, form in self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))]):
             yield form, self._rows(data, part, live)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:

@@ -89,8 +89,9 @@ class Unknowns:
 
     def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
         """Add scale * v to a function and update its ghosts; scale: one number, or one for each entry."""
-        function.x.array[self.owned] += scale * v.array_r
-        function.x.scatter_forward()
+        values = function.x
+        values.array[self.owned] += scale * v.array_r
+        values.scatter_forward()
 
 
 def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:

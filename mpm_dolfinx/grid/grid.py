@@ -57,13 +57,17 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (size,) of values by index, as floats also for no values (numpy's bincount gives integers)."""
+    """Return the sums (..., size) of values (..., n) by index (n,); floats also for no values, unlike numpy's."""
+    if values.ndim > 1:
+        rows = values.reshape(-1, len(index))
+        index, whole = (index + size * np.arange(len(rows))[:, None]).ravel(), size * len(rows)
+        return sum_by(index, rows.ravel(), whole).reshape(*values.shape[:-1], size)
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return all numbers (n,) of ranges (m,) given by first number and count, and the range (n,) of each number."""
-    of = np.repeat(np.arange(len(count)), count)
+    of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
@@ -71,7 +75,7 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
     """Return which numbers (...) occur in sorted `chosen` (m,), without the large tables of numpy's isin."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
-    return chosen[np.minimum(np.searchsorted(chosen, numbers), len(chosen) - 1)] == numbers
+    return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
@@ -108,7 +112,7 @@ class Cells:
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
         self.cell_number = grid.number(grid.index_from_base(self.midpoints))
         if grid.copies > 1:
-            brought = np.concatenate(grid.comm.allgather(np.flatnonzero(owners == grid.comm.rank)))
+            brought = np.concatenate(grid.comm.allgather((owners == grid.comm.rank).nonzero()[0]))
             self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
         self.sizes = None if grid.even else grid.sizes_of(self.cell_number)
         self.locals = np.full(len(owners), -1, dtype=np.int32)
@@ -130,9 +134,9 @@ class Cells:
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
 
 
-def of_cells(name: str) -> property:
-    """Return a property of a grid that reads an attribute of its `Cells`."""
-    return property(lambda grid: getattr(grid._of_process, name))
+def of_cells(name: str) -> cached_property:
+    """Return a property of a grid that is an attribute of its `Cells`, which are made once."""
+    return cached_property(lambda grid: getattr(grid._of_process, name))
 
 
 class Grid:
@@ -307,7 +311,7 @@ class Grid:
             return self.low + (index + share) * self._h
         out = np.empty(index.shape)
         for a, (lines, width) in enumerate(zip(self.lines, self.widths, strict=True)):
-            i = np.clip(index[..., a], 0, len(width) - 1)
+            i = np.minimum(np.maximum(index[..., a], 0), len(width) - 1)
             part = share if np.isscalar(share) else share[..., a]
             out[..., a] = lines[i] + (index[..., a] - i + part) * width[i]
         return out
@@ -332,11 +336,11 @@ class Grid:
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the next line (n,), m, above coordinates (n,) in a grid of unequal cells; inf above the last one."""
-        return np.append(self.lines[axis], np.inf)[np.searchsorted(self.lines[axis], x, side="right")]
+        return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the indices of cells at coordinates, m, along an axis of unequal cells, clamped into the grid."""
-        return np.clip(np.searchsorted(self.lines[axis], x, side="right") - 1, 0, self.shape[axis] - 1)
+        return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
     owners = of_cells("owners")
@@ -385,7 +389,7 @@ class Grid:
 
     def _made(self, owner: NDArray[np.int32]) -> Cells:
         """Return the cells and their mesh; owner: rank of each cell of one copy, of the grid's shape."""
-        own = np.flatnonzero(owner.ravel() == self.comm.rank)
+        own = (owner.ravel() == self.comm.rank).nonzero()[0]
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
         ranks, first = destinations(owner, own)
         each = np.tile(np.diff(first), self.copies)
@@ -397,7 +401,7 @@ class Grid:
         """Return the lexicographic numbers (n, 2^d) of the nodes of cells."""
         bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
         index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
-        return np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(self.shape + 1))
+        return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
     def _nodes(self) -> NDArray[np.float64]:
         """Return the positions (n, d), m, of this process's share of the nodes, in lexicographic order."""
@@ -467,7 +471,7 @@ class Grid:
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
-        return np.clip(i, 0, self.shape - 1, out=i)
+        return np.minimum(np.maximum(i, 0), self.shape - 1, out=i)
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the rank that owns each cell, given by lexicographic number."""

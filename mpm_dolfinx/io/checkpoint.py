@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
-from mpm_dolfinx.conditions.acting import Outcome
+from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
 from mpm_dolfinx.grid.grid import Grid
@@ -232,7 +232,7 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
     """Return a stored outcome, reduced to the present conditions; a condition that is new keeps its present outcome.
 
-    Raises ValueError for other shapes, and for a non-finite displacement or velocity of a tool.
+    Raises ValueError for other shapes, and for a non-finite motion of a tool.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
     if "energy" in outcome:
@@ -245,7 +245,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
                 continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
                 raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
-            if quantity in ("tool_travel", "tool_velocity") and not np.isfinite(value).all():
+            if quantity in ("tool_travel", *MOTIONS) and not np.isfinite(value).all():
                 raise ValueError(f"outcome/{quantity}/{name} is not finite")
     return found
 

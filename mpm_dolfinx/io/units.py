@@ -44,6 +44,8 @@ FIELDS = {
         "tool_force_moment_NAME": "N, in plane strain moment about its centre per metre; in 3D _x, _y, _z, N m",
         "tool_travel_NAME": "m, displacement of the tool NAME under its load; of a free tool _x, _y, _z",
         "tool_velocity_x_NAME, _y_, _z_": "m/s, velocity of the free tool NAME",
+        "tool_rotation_NAME": "rad, counterclockwise rotation of the free tool NAME, in 2D",
+        "tool_spin_NAME": "rad/s, angular velocity of the free tool NAME, in 2D",
         "energy_NAME": "J, in plane strain J/m, see `Result.energies`",
         "outflow_NAME": "m^3/s, in plane strain m^2/s, outflow through the open side NAME",
     },

@@ -299,13 +299,14 @@ class SceneMaterials:
 
         `value` returns one value a point or a single number; for a uniform material without columns also one (...).
         """
-        each = []
+        each, shapes = [], set()
         for i in self._used:
-            rows = np.flatnonzero(points.material == i)
-            found = np.asarray(value(self._at(points, i, rows), *(column[rows] for column in columns)))
-            each.append((rows, found, found.shape[bool(columns or self._fields[i]) :]))
-        out = np.zeros((len(points), *np.broadcast_shapes(*(shape for *_, shape in each))))
-        for rows, found, _ in each:
+            rows = (points.material == i).nonzero()[0]
+            found = np.asarray(value(self._at(points, i, rows), *[column[rows] for column in columns]))
+            each.append((rows, found))
+            shapes.add(found.shape[bool(columns or self._fields[i]) :])
+        out = np.zeros((len(points.id), *(shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes))))
+        for rows, found in each:
             out[rows] = found
         return out
 
@@ -319,7 +320,7 @@ class SceneMaterials:
         """
         data = dict(points.data)
         for i in self._used:
-            rows, m = np.flatnonzero(points.material == i), self.materials[i]
+            rows, m = (points.material == i).nonzero()[0], self.materials[i]
             follow = [k for k in self._fields[i] if getattr(getattr(m, k), "follows", False)]
             own = [name for name in self._fields[i] if name in named or name not in follow]
             try:
@@ -333,14 +334,16 @@ class SceneMaterials:
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
         """Return a material with constants as arrays over some of its points; uniform materials remain unchanged."""
+        if not self._fields[i]:
+            return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}
-        return _expanded(self.materials[i], values, len(rows)) if values else self.materials[i]
+        return _expanded(self.materials[i], values, len(rows))
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return all parameters at the points (n, ...); zero if a point's law does not have them."""
         out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
         for i in self._used:
-            rows = np.flatnonzero(points.material == i)
+            rows = (points.material == i).nonzero()[0]
             at = self._at(points, i, rows)
             for name in self.materials[i].parameters:
                 out[name][rows] = getattr(at, name)
@@ -423,7 +426,7 @@ class SceneMaterials:
         """Return at which points (n,) the state of a law has changed from rest."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
-            rows = np.flatnonzero(law_of == number)
+            rows = (law_of == number).nonzero()[0]
             for name, at_rest in law.state.items():
                 if name in DRIED:
                     continue
@@ -532,7 +535,7 @@ class SceneMaterials:
         """Return every law with the indices and the data of its points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
-        rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
+        rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 
 
@@ -594,7 +597,7 @@ def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tupl
     before = 0
     for body in bodies:
         if body.material == material:
-            of_body = np.flatnonzero((ids >= start) & (ids < start + len(body)))
+            of_body = ((ids >= start) & (ids < start + len(body))).nonzero()[0]
             here.append(of_body)
             rows.append(ids[of_body] - start + before)
             before += len(body)

@@ -123,7 +123,7 @@ class GhostPenalty:
             f.x.array[own] = total / volume
         for f in (self.fill, self.modulus):
             f.x.scatter_forward()
-        ghosts = grid.num_owned + np.flatnonzero(fill[grid.num_owned :])
+        ghosts = grid.num_owned + fill[grid.num_owned :].nonzero()[0]
         neighbours = grid.facet_cells[grid.cell_facets[own]].sum(axis=2) - own[:, None]  # -1 at the grid's boundary
         self.beside.x.array[own] = np.where(neighbours >= 0, fill[neighbours], 0.0).max(axis=1, initial=0.0)
         self.beside.x.scatter_forward()

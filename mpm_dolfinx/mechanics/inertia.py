@@ -216,7 +216,7 @@ class InertiaForms:
 
         chords: the last result, which all forms at the same u share; which: 0 for gradients, 1 for rotations.
         """
-        G, d = data.gradients(self._u), self.grid.dim
+        G, d = data.gradients(self._u.x.array), self.grid.dim
         if self._midpoint.value:
             return chords(G, lambda: chord(G.reshape(-1, d, d)))[which].reshape(-1, d * d)
         return np.broadcast_to(np.eye(d).ravel(), G.shape) if which else G

@@ -31,7 +31,6 @@ from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatric
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
-from mpm_dolfinx.grid.active import Active
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -43,6 +42,7 @@ from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
+from mpm_dolfinx.points.active import Active, ActiveSet
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
 from mpm_dolfinx.pores.retention import Retentions
 
@@ -97,7 +97,8 @@ class MomentumForms:
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
         """Displacement increment since the start of the step, m."""
-        self._rooms = [fem.Function(V) for _ in range(3)]  # buffers for simultaneous sums of forces
+        rooms = [fem.Function(V) for _ in range(3)]
+        self._rooms = [(room, room.x.array) for room in rooms]  # buffers for simultaneous sums of forces
         averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
         self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
@@ -124,7 +125,7 @@ class MomentumForms:
         self.elastic = not any(law.state for law, *_ in laws)
         """Whether no law has a state: in yielding soil the tangent of one substep misleads the next."""
         self.ghost = GhostPenalty(grid, V, at_points)
-        kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *self._rooms)]
+        kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *rooms)]
         self.active = Active(grid, pressure is not None, *kept)
         """The active cells; u is zero at other nodes."""
 
@@ -183,22 +184,22 @@ class MomentumForms:
         """Return derivatives of the forces at (u, p) by the cells' pressures through suction, see `OfSuction.rows`."""
         return [] if self._of_suction is None else self._of_suction.rows(data)
 
-    def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> NDArray[np.int64]:
+    def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
         """Set the contents of the owned cells (n,) that are not empty, and the active set: see `GhostPenalty`."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
-        self.active.set(cells, np.flatnonzero(self.active_nodes(cells)))
-        return cells
+        self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
+        return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
         """Return the sum of nodal forces over all processes, in buffer `room`, a local array; adders add the forces."""
-        out = self._rooms[room]
-        out.x.array[self.active.dofs] = 0.0
+        carrier, out = self._rooms[room]
+        out[self.active.now.dofs] = 0.0
         for add in adders:
-            add(out.x.array)
-        return sum_ghosts(out)
+            add(out)
+        return out if self.grid.comm.size == 1 else sum_ghosts(carrier)
 
-    @property
+    @cached_property
     def nodal(self) -> NDArray[np.float64]:
         """u by nodes (nodes, d), m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
@@ -230,13 +231,14 @@ class MomentumForms:
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (nodes,) at the active local nodes of values (cells,) of owned cells, over all processes."""
-        shared, d = self._rooms[0], self.grid.dim
-        nodes, at = np.unique(self.grid.cell_nodes[cells], return_inverse=True)
-        shared.x.array[self.active.dofs] = 0.0
-        shared.x.array[nodes * d] = sum_by(at.ravel(), np.repeat(values, 2**d), len(nodes))
+        (shared, values_at), d = self._rooms[0], self.grid.dim
+        nodes = self.active.now.nodes
+        at = nodes.searchsorted(self.grid.cell_nodes[cells])
+        values_at[self.active.now.dofs] = 0.0
+        values_at[nodes * d] = sum_by(at.ravel(), values.repeat(2**d), len(nodes))
         sum_ghosts(shared)
         shared.x.scatter_forward()
-        return shared.x.array[self.active.nodes * d]
+        return values_at[nodes * d]
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
         """Return the connected parts of the bodies in active cells, from the parts of the cells: see `parts_of_cells`.
@@ -246,11 +248,11 @@ class MomentumForms:
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
         if grid.copies > 1:
             cells = np.full(grid.num_local, -1)
-            cells[self.active.cells] = nodes[self.active.nodes] = 0
+            cells[self.active.now.cells] = nodes[self.active.now.nodes] = 0
             return Parts(1, cells, nodes)
-        own = self.active.cells[self.active.cells < grid.num_owned]
+        own = self.active.now.cells[self.active.now.cells < grid.num_owned]
         total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
-        nodes[self.active.nodes] = np.rint(total / count_of).astype(np.int64) - 1
+        nodes[self.active.now.nodes] = np.rint(total / count_of).astype(np.int64) - 1
         return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -259,11 +261,11 @@ class MomentumForms:
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
             return nodes
-        shared = self._rooms[0]
-        shared.x.array[:] = np.repeat(nodes, self.grid.dim)
+        shared, values = self._rooms[0]
+        values[:] = nodes.repeat(self.grid.dim)
         _compat.scatter_reverse_add(shared)
         shared.x.scatter_forward()
-        return shared.x.array[:: self.grid.dim] > 0
+        return values[:: self.grid.dim] > 0
 
 
 def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
@@ -303,7 +305,7 @@ class MomentumSystem:
         self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
         self.locks = forms.dilatation is not None
         """Whether some law takes F-bar: it yields, or is nearly incompressible."""
-        active = forms.active.dofs
+        active = forms.active.now.dofs
         self.touched = active[active < d * forms.u.function_space.dofmap.index_map.size_local]
         """Degrees of freedom on which forces may act, fixed or free."""
         self.parts, comm = parts, forms.grid.comm
@@ -313,6 +315,8 @@ class MomentumSystem:
         """Parts of the unknowns, and of the degrees of freedom `touched`."""
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
+        self.of_whole = self.unknowns.vector()
+        """Rounding error of a part, N, if all of its unknowns had that of this one."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = np.setdiff1d(active, dofs)
@@ -333,15 +337,16 @@ class MomentumSystem:
         """Rounding error of the residual of each part (parts,), N."""
         return self.of_parts.norms(self.rounding.array_r)
 
-    def force_of_parts(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the norms (parts,), N, of forces on the degrees of freedom `touched`."""
-        return self._touched.norms(forces)
+    def forces_of_parts(self, forces: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the norms (k, parts), N, of k forces on the degrees of freedom `touched`."""
+        return self._touched.norms(np.array(forces))
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
         """Set the rounding error of the residual at the active local nodes, N."""
         self.rounding.array_w[:] = nodes[
-            np.searchsorted(self._forms.active.nodes, self.unknowns.owned // self.unknowns.dim)
+            self._forms.active.now.nodes.searchsorted(self.unknowns.owned // self.unknowns.dim)
         ]
+        self.of_whole.array_w[:] = self.rounding.array_r * np.sqrt(self.of_parts.sizes)[self.of_parts.of]
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], ...] | None:
@@ -459,7 +464,7 @@ class MomentumProblem:
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
-        dofs = self.forms.active.dofs
+        dofs = self.forms.active.now.dofs
         return [np.where(self.system.unknowns.map.indices[dofs] >= 0, values[dofs], 0.0) for values in found]
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
@@ -469,19 +474,19 @@ class MomentumProblem:
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
         """Return the out-of-balance nodal forces at u and their scale (parts,), N, in each part."""
-        system = self.system
+        forms, system = self.forms, self.system
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # walls bear the penalty forces of sides next to them
         b[system.touched] -= self._pulls  # not in the scale: at the start of a step they far exceed the forces
         r = system.unknowns.gather(b, system.residual)
-        step = system.unknowns.gather(self.forms.u.x.array, system.step)
+        step = system.unknowns.gather(forms.nodal.ravel(), system.step)
         system.penalty.multAdd(step, r, r)
         for one in self.loads:
             one.push(self.at, r, system.unknowns)
             if (inertia := one.inertia(self.at)) is not None:
                 r += inertia
                 norms.append(system.of_parts.norms(inertia.array_r))
-        return r, np.max(norms, axis=0)
+        return r, np.maximum.reduce(norms)
 
     def unbalanced(self) -> NDArray[np.float64]:
         """Return the forces of the stresses less the loads at u, a local array, N, without penalties."""
@@ -492,17 +497,16 @@ class MomentumProblem:
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
-        norms = [system.force_of_parts(forces)]
+        terms = [forces]
         if self._varying:
             loads, own = (
                 forms.summed(1 + room, [getattr(one, name) for one in self._varying])[system.touched]
                 for room, name in enumerate(("loads", "resists"))
             )
             external, forces = external + loads, forces + own
-            norms.append(system.force_of_parts(own))
-        norms.append(system.force_of_parts(external))
+            terms.append(own)
         b[system.touched] = forces - external
-        return b, norms
+        return b, [*system.forces_of_parts([*terms, external])]
 
     def powers(self) -> dict[str, float]:
         """Return powers at u on this process, W: of stresses, viscous resistance, friction and external loads."""
@@ -535,12 +539,14 @@ class MomentumProblem:
         below the rounding error. The second result takes scales of at least rounding error over tolerance.
         """
         system, parts = self.system, self.system.of_parts
-        size, rounding = np.abs(r.array_r), system.rounding.array_r
-        counts = relative(parts.norms(size if first else np.maximum(size - rounding, 0.0)), scales)
-        least = rounding * np.sqrt(parts.sizes)[parts.of] / self._tolerance
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            full = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
-        return counts, relative(full, np.ones(parts.count))
+        both = np.zeros((2, system.unknowns.size))
+        size = np.abs(r.array_r)
+        both[0] = size if first else np.maximum(size - system.rounding.array_r, 0.0)
+        least = np.maximum(scales[parts.of], system.of_whole.array_r / self._tolerance)
+        np.divide(size, least, out=both[1], where=size > 0)
+        counts, full = parts.norms(both)
+        full[~(full < np.inf)] = np.inf
+        return relative(counts, scales), full
 
     def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
         """Return the forces (d,), N, of the walls by name at u; the residual must have been assembled there."""

@@ -122,7 +122,7 @@ class PlateLoads(Loads):
     def moved(self, u: fem.Function) -> Loads:
         """Return the plates with their tilt changed by a displacement u."""
         data, d = self._data, self._data.points.grid.dim
-        slope = np.einsum("ni,nij->nj", data["normal"], data.gradients(u).reshape(-1, d, d))
+        slope = np.einsum("ni,nij->nj", data["normal"], data.gradients(u.x.array).reshape(-1, d, d))
         slope = slope - (slope * data["normal"]).sum(axis=1, keepdims=True) * data["normal"]
         return PlateLoads(self._forms, data.having(tilt=data["tilt"] + slope), self._even)
 

@@ -47,7 +47,9 @@ much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % t
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
     """Return the weight of the corner-based volume ratio at the start of a step in the cells of a material."""
     stiffness = material.oedometric / material.shear
-    return np.clip(2 - stiffness / STIFF_WET, 0.0, 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
+    return (
+        np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
+    )
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ class QuadraturePoints:
         law_places = self._law_places(cut, pieces)
         if len(self.laws) > 1 or law_places is not pieces:
             part = cut.to_cells(self._scene.part_of(cut.points))
-            rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
+            rows = [(part == number).nonzero()[0] for number in range(len(self.laws))]
             parts = [(own, law_places.part(own)) for own in rows]
         return PiecePlaces(pieces, tuple(parts))
 
@@ -182,8 +184,9 @@ class QuadraturePoints:
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         if self._locks and cut.domains:
-            share = self._scene.table(points, lambda m: corner_share(m, bool(self._fluid)))
-            share = self._scene.locking(points) * share
+            share = self._scene.locking(points) * self._scene.table(
+                points, lambda m: corner_share(m, bool(self._fluid))
+            )
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
             if ACROSS in fields:

@@ -66,7 +66,7 @@ def corner_bits(dim: int) -> NDArray[np.int64]:
 def _faces(dim: int) -> NDArray[np.int64]:
     """Return the corners (2d, 2^(d-1)) of the faces of a domain; face 2 a + e is the one at end e of axis a."""
     bits = corner_bits(dim)
-    return np.stack([np.flatnonzero(bits[:, axis] == end) for axis in range(dim) for end in (0, 1)])
+    return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
 
 FACES = {d: _faces(d) for d in (2, 3)}
@@ -108,12 +108,11 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the signed volumes (k, n) of the simplices of domains with these vertices (v, d, n)."""
-    d, (*others, middle) = v.shape[1], simplices(v.shape[1]).T
-    facets = np.stack([v[vertex] for vertex in others], axis=-1)  # (k, d, n, d)
-    s = np.moveaxis(facets, (3, 1, 0, 2), (0, 1, 2, 3)).reshape(d, d, -1)
-    height = s[0] - np.moveaxis(v[middle], 1, 0).reshape(d, -1)
+    d, vertex = v.shape[1], simplices(v.shape[1]).T
+    s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
+    height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
     volume = (_area_vectors(s) * height).sum(axis=0) / d
-    return volume.reshape(len(middle), -1)
+    return volume.reshape(vertex.shape[1], -1)
 
 
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,7 +137,7 @@ def _triple(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float6
 
 def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the cross products (3, n) of vectors (3, n)."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
@@ -168,7 +167,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     volume, middle = np.abs(simplex_volumes(v)), v[-1]
     whole, moment = volume.sum(axis=0), np.zeros_like(middle)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
-        moment += share * (v[simplex].mean(axis=0) - middle)
+        moment += share * (v[simplex].sum(axis=0) / len(simplex) - middle)
     return (middle + np.divide(moment, whole, out=np.zeros_like(moment), where=whole > 0)).T.copy()
 
 
@@ -255,7 +254,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     in_cells, y = on_planes(grid, true, x, 1)
     v = vertices(y)
     volume = simplex_volumes(v)
-    flat = np.flatnonzero(~volume.any(axis=0))
+    flat = (~volume.any(axis=0)).nonzero()[0]
     if len(flat):  # thinner than the snapping distance and on a plane: snapping would leave no volume
         in_cells[:, :, flat] = true[:, :, flat]
         y[:, :, flat] = x[:, :, flat]
@@ -267,10 +266,10 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     # an inverted simplex counts with positive volume: its negative volume is subtracted twice
     simplex, folded = np.nonzero(volume < 0)
     if len(folded):
-        rotated = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
-        s = np.concatenate([s, rotated, rotated], axis=2)
-        outward = np.concatenate([outward, *[-_area_vectors(rotated)] * 2], axis=1)
-        owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
+        turned = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
+        s = np.concatenate([s, turned, turned], axis=2)
+        outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
+        owner = np.concatenate([owner, *[folded.repeat(d + 1)] * 2])
     facet = np.arange(s.shape[2])
     for axis in range(d):
         s, facet = sliced(s, facet, axis, grid)
@@ -284,9 +283,9 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the normals (d, m) of segments or triangles (d, d, m); their length is the size."""
     e = s[1:] - s[0]
     if len(e) == 1:
-        return np.stack([e[0, 1], -e[0, 0]])
+        return np.array([e[0, 1], -e[0, 0]])
     (ax, ay, az), (bx, by, bz) = e
-    return 0.5 * np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return 0.5 * np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _facets(dim: int) -> NDArray[np.int64]:
@@ -309,12 +308,12 @@ class _Slots:
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
-        self.low = np.clip(np.floor(y.min(axis=0)).astype(np.int64), 0, top)
-        self.high = np.clip(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low, top)
+        self.low = np.minimum(np.maximum(np.floor(y.min(axis=0)).astype(np.int64), 0), top)
+        self.high = np.minimum(np.maximum(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low), top)
         span = self.high - self.low + 1
         stop = np.cumsum(span.prod(axis=0))
         self.size = int(stop[-1]) if len(stop) else 0
-        self.point = np.repeat(np.arange(y.shape[2]), span.prod(axis=0))
+        self.point = np.arange(y.shape[2]).repeat(span.prod(axis=0))
         self._stride = np.cumprod(np.concatenate([np.ones_like(span[:1]), span[:0:-1]]), axis=0)[::-1]
         self._start, self._span = stop - span.prod(axis=0), span
         number = np.arange(self.size) - self._start[self.point]
@@ -326,11 +325,11 @@ class _Slots:
         place = index.astype(np.int64) - self.low[:, owner]
         return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
 
-    def sums_beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """Return the sums of the slots' values over the cells further along an axis in the same column."""
         out = np.zeros(self.size)
         for steps in range(1, int(self._span[axis].max(initial=1))):
-            has = np.flatnonzero(self._place[axis] + steps < self._span[axis][self.point])
+            has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
             out[has] += values[has + steps * self._stride[axis][self.point[has]]]
         return out
 
@@ -345,17 +344,17 @@ def _sum(
 ) -> Pieces:
     """Sum the slices of the surfaces by point and cell into pieces."""
     d = grid.dim
-    index = np.floor(s.mean(axis=0))
+    index = np.floor(s.sum(axis=0) / d)
     least = s.min(axis=0)
     most = s.max(axis=0)
     ends = []
     for a in range(d):
         # a slice on a grid plane belongs to the cell of the body behind it
         index[a] -= (area[a] > 0) & (most[a] == index[a])
-        np.clip(index[a], slots.low[a][owner], slots.high[a][owner], out=index[a])
+        np.minimum(np.maximum(index[a], slots.low[a][owner]), slots.high[a][owner], out=index[a])
         flat = most[a] - least[a] < grid.snap[a]  # rounding may snap one of two touching domains only: hence twice
-        lower = np.flatnonzero(flat & (area[a] < 0) & (most[a] - index[a] < 2 * grid.snap[a]))
-        upper = np.flatnonzero(flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * grid.snap[a]))
+        lower = (flat & (area[a] < 0) & (most[a] - index[a] < 2 * grid.snap[a])).nonzero()[0]
+        upper = (flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * grid.snap[a])).nonzero()[0]
         ends.append((lower, upper))
     slot = slots.of(owner, index)
 
@@ -372,19 +371,19 @@ def _sum(
 
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
     shadow = total(area[0])
-    beyond = slots.sums_beyond(shadow, 0)
+    beyond = slots.beyond(shadow, 0)
     volume = total(area[0] * sums[0] / d) + beyond
     moments = [total(products / 2 * (sums[0] ** 2 + pair(0, 0))) + beyond / 2]
     for a in range(1, d):
         within = total(products * (sums[0] * sums[a] + pair(0, a)))
-        moments.append(within + slots.sums_beyond(total(area[0] * sums[a] / d), 0))
+        moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
     pairs = [(1, 2), (0, 2), (0, 1)] if d == 3 else [(0, 1)] * second
     pairs += [(a, a) for a in range(d)] * second
     uneven = _products(pairs, x, sums, area[0], pair, total, slots)
 
     size = volume if grid.even else volume * grid.widths_of(slots.cell.T).prod(axis=1)
     whole = sum_by(slots.point, size, len(slots.low[0]))[slots.point]
-    kept = np.flatnonzero(size / whole > SLIVER)
+    kept = (size / whole > SLIVER).nonzero()[0]
     point, cell = slots.point[kept], slots.cell[:, kept].T
     h = grid.widths_of(cell).T  # (d, m), or of equal cells (d,)
     if grid.axisymmetric:
@@ -392,7 +391,7 @@ def _sum(
         squares = total(area[0] / 12 * (x0 + x1) * (x0**2 + x1**2)) + beyond / 3
         products = area[0] / 24 * (x0**2 * (3 * x[0, 1] + x[1, 1]) + x1**2 * (x[0, 1] + 3 * x[1, 1]))
         products = total(products + area[0] / 12 * x0 * x1 * sums[1])
-        products += slots.sums_beyond(total(area[0] * sums[1] / 2), 0) / 2
+        products += slots.beyond(total(area[0] * sums[1] / 2), 0) / 2
         r = s[:, 0].mean(axis=0)
         if grid.even:
             area[1] *= grid.low[0] + grid.h[0] * r  # sections across the axis are rings too
@@ -401,21 +400,23 @@ def _sum(
     faces = np.empty((len(kept), d, 2))
     for a in range(d):
         shadow = total(area[a]) if a else shadow
-        beyond = slots.sums_beyond(shadow, a)
+        beyond = slots.beyond(shadow, a)
         lower, upper = (total(area[a], chosen) for chosen in ends[a])
         # the section of the body just above the lower and just below the upper face
-        faces[:, a] = np.stack([beyond + shadow - lower, beyond + upper], axis=1)[kept]
+        faces[:, a] = np.array([beyond + shadow - lower, beyond + upper]).T[kept]
         faces[:, a] *= grid.cell_volume / h[a] if grid.even else (h.prod(axis=0) / h[a])[:, None]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
     volume = volume[kept]
     hoop = np.empty((len(kept), 0))
     spread = np.zeros((len(kept), d, d))
-    middle = np.stack([m[kept] / volume for m in moments], axis=1)
-    centroid = np.clip(middle, grid.snap, 1 - grid.snap)
+    middle = np.array([m[kept] / volume for m in moments]).T.copy()
+    centroid = np.minimum(np.maximum(middle, grid.snap), 1 - grid.snap)
     for (a, b), product in zip(pairs, uneven, strict=True):
         # rounding may spoil it for very thin pieces: clip to its exact range
-        mean = np.clip(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25, 0.25)
+        mean = np.minimum(
+            np.maximum(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25), 0.25
+        )
         spread[:, a, b] = spread[:, b, a] = mean * h[a] * h[b]
     mixed = (
         np.stack([spread[:, 1, 2], spread[:, 0, 2], spread[:, 0, 1]], axis=1) if d == 3 else np.zeros((len(kept), 0))
@@ -462,14 +463,14 @@ def _rings(
     cell (m, 2): indices; c (m, 2): centroids in the plane, from 0 to 1; squares, products (m,): means of r^2 and r z.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
-    squares = np.clip(squares, x**2, x)  # slivers may lose them in rounding
-    products = np.clip(products, np.maximum(0.0, x + z - 1), np.minimum(x, z))
+    squares = np.minimum(np.maximum(squares, x**2), x)  # slivers may lose them in rounding
+    products = np.minimum(np.maximum(products, np.maximum(0.0, x + z - 1)), np.minimum(x, z))
     inner = grid.low[0] + h * cell[:, 0] if grid.even else grid.lines[0][cell[:, 0]]
     radius = inner + h * x
     of_volume = np.stack([inner * x + h * squares, inner * z + h * products], axis=1) / radius[:, None]
     product = h * height * (products - (x + z) / 2 + 0.25)
     hoop = np.stack([h * (x - 0.5), height * (z - 0.5), product, radius], axis=1)
-    return radius, np.clip(of_volume, grid.snap, 1 - grid.snap), hoop
+    return radius, np.minimum(np.maximum(of_volume, grid.snap), 1 - grid.snap), hoop
 
 
 def _products(
@@ -512,7 +513,7 @@ def _products(
     out = []
     for a, b in pairs:
         rest = [axis for axis in (a, b) if axis]
-        out.append((total(mean(0, a, b)) + slots.sums_beyond(total(mean(*rest)), 0)) / (3 - len(rest)))
+        out.append((total(mean(0, a, b)) + slots.beyond(total(mean(*rest)), 0)) / (3 - len(rest)))
     return out
 
 
@@ -548,11 +549,11 @@ def cut_faces(
     # sizes follow from local coordinates, which are never degenerate; a triangle is half of a face
     size = _size(whole[:, d:]).reshape(len(split), m)
     share = (size / size.sum(axis=0)).ravel()
-    s = np.concatenate([whole, np.repeat(np.eye(d)[:, :, None], count, axis=2)], axis=1)  # and barycentric coordinates
+    s = np.concatenate([whole, np.eye(d)[:, :, None].repeat(count, axis=2)], axis=1)  # and barycentric coordinates
     owner = np.arange(count)
     for axis in range(d):
         s, owner = sliced(s, owner, axis, grid)
-    kept = np.flatnonzero(_size(s[:, -d:-1]) * share[owner] > SLIVER)  # drop slices that only touch a plane
+    kept = (_size(s[:, -d:-1]) * share[owner] > SLIVER).nonzero()[0]  # drop slices that only touch a plane
     s, owner = s[:, :, kept], owner[kept]
     if d == 3:
         s, owner = _polygons(grid, s, owner)
@@ -610,9 +611,9 @@ def _polygons(
     after, sides = _around(group), np.bincount(group, minlength=len(first))
     middle = np.stack([sum_by(group, x, len(first)) for x in v]) / np.maximum(sides, 1)
     triangle = sides[group] == 3
-    begins = np.flatnonzero(np.diff(group, prepend=-1))
+    begins = np.diff(group, prepend=-1).nonzero()[0]
     alone = begins[triangle[begins]]
-    fan = np.flatnonzero(sides[group] > 3)
+    fan = (sides[group] > 3).nonzero()[0]
     parts = np.stack([v[:, alone], v[:, after[alone]], v[:, after[after[alone]]]])
     fans = np.stack([middle[:, group[fan]], v[:, fan], v[:, after[fan]]])
     of = of[first]
@@ -622,7 +623,7 @@ def _polygons(
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the next member (n,) of each group, cyclically; groups (n,) are in order."""
-    after, starts = np.arange(1, len(group) + 1), np.flatnonzero(np.diff(group, prepend=-1))
+    after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
 
@@ -662,21 +663,21 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 def cut_at(s, owner, axis: int, plane):
     """Cut each simplex at its plane; return the parts below and above with their owners."""
-    order = np.argsort(s[:, axis], axis=0)
+    order = s[:, axis].argsort(axis=0)
     s = np.take_along_axis(s, order[:, None], axis=0)
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
     dim = len(s) - 1
     parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}
     owners = {"below": [owner[:0]], "above": [owner[:0]]}
     for k in range(1, dim + 1):
-        chosen = np.flatnonzero(count == k)
+        chosen = (count == k).nonzero()[0]
         v, c = s[:, :, chosen], plane[chosen]
         points = {(i,): v[i] for i in range(dim + 1)}
         for i in range(k):
             for j in range(k, dim + 1):
                 points[i, j] = _on_plane(v[i], v[j], axis, c)
         for where, simplices in _CUTS[dim][k].items():
-            parts[where] += [np.stack([points[p] for p in simplex]) for simplex in simplices]
+            parts[where] += [np.array([points[p] for p in simplex]) for simplex in simplices]
             owners[where] += [owner[chosen]] * len(simplices)
     return (
         np.concatenate(parts["below"], axis=2),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -28,7 +29,7 @@ def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int
     Ids beyond the seeded ones are assigned to the bodies in turn.
     """
     beyond = ids - starts[-1]
-    return np.where(beyond < 0, np.searchsorted(starts, ids, side="right") - 1, beyond % max(1, len(starts) - 1))
+    return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -152,7 +153,7 @@ class MaterialPoints:
     @property
     def arrays(self) -> tuple[NDArray, ...]:
         """All arrays."""
-        return (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), *self.data.values())
+        return (*_ARRAYS(self), *self.data.values())
 
     def __len__(self) -> int:
         return len(self.id)
@@ -205,7 +206,7 @@ class MaterialPoints:
 
     def joined(self, other: MaterialPoints) -> MaterialPoints:
         """Return these points and others, ordered by id."""
-        order = np.argsort(np.concatenate([self.id, other.id]))
+        order = np.concatenate([self.id, other.id]).argsort()
         pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
         data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
         return type(self)(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
@@ -221,7 +222,7 @@ class MaterialPoints:
         one = tuple([values is other for other in arrays].index(True) for values in arrays)
         equal = len(set(exchange.comm.allgather(one))) == 1  # else processes make different numbers of transfers
         received = (self if equal else self._copied()).map(exchange.send)
-        order = np.argsort(received.id)
+        order = received.id.argsort()
         return received.map(lambda rows: rows[order])
 
     def _copied(self) -> MaterialPoints:
@@ -231,10 +232,14 @@ class MaterialPoints:
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the indices in `ids` of points of this process, and the indices of these points."""
-        at = np.searchsorted(self.id, ids)
-        found = np.flatnonzero((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)) if len(self) else []
+        at = self.id.searchsorted(ids)
+        found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)
         return found, at[found]
+
+
+_ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data"))
+"""Returns all arrays of points outside of `data`."""
 
 
 class PlacedPoints(MaterialPoints):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import corner_bits
 
@@ -49,14 +49,23 @@ class OfParts:
     of: NDArray[np.int64]
     count: int
 
+    @cached_property
+    def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Order of the entries by parts, first place of each part in it, and the parts with entries."""
+        sizes = np.bincount(self.of, minlength=self.count)
+        present = sizes.nonzero()[0]
+        return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
+
     def sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (count,) of entries (n,) over each part, of all processes."""
-        return over_all(self.comm, sum_by(self.of, values, self.count))
+        """Return the sums (..., count) of entries (..., n) over each part, of all processes."""
+        order, start, present = self._sorted
+        out = np.zeros((*values.shape[:-1], self.count))
+        out[..., present] = np.add.reduceat(values[..., order], start, axis=-1)
+        return over_all(self.comm, out)
 
     def norms(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Euclidean norms (count,) of entries (n,) of each part."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.sqrt(self.sums(values**2))
+        """Return the Euclidean norms (..., count) of entries (..., n) of each part."""
+        return np.sqrt(self.sums(values * values))
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
@@ -68,9 +77,11 @@ def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
     """Return norms / scales; 0 where the norm is round-off, and inf in place of nan, so that comparisons notice it."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        ratio = np.where((scales > 0) & (norms < np.inf), norms / scales, np.inf)
-    return np.where(norms <= round_off, 0.0, ratio)
+    ratio = np.empty(norms.shape)
+    ratio.fill(np.inf)
+    np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
+    ratio[norms <= round_off] = 0.0
+    return ratio
 
 
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
@@ -79,17 +90,17 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     Cells with common nodes belong to one part; inactive cells have 0. The order of the first cells numbers the parts,
     alike on any number of processes.
     """
-    cells, out = np.flatnonzero(active), np.zeros(len(active), dtype=np.int64)
+    cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
-    own, count = _joined(np.repeat(np.arange(len(cells)), 2**grid.dim), at.ravel(), (len(cells), len(nodes)))
+    own, count = _joined(np.arange(len(cells)).repeat(2**grid.dim), at.ravel(), (len(cells), len(nodes)))
     if grid.comm.size > 1:
         of_node = np.zeros(len(nodes), dtype=np.int64)
-        of_node[at.ravel()] = np.repeat(own, 2**grid.dim)
+        of_node[at.ravel()] = own.repeat(2**grid.dim)
         own, count = _over_processes(grid, own, count, nodes, of_node)
     first = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(first, own, grid.cell_number[cells].astype(np.int64))
     place = np.empty(count, dtype=np.int64)
-    place[np.argsort(over_all(grid.comm, first, MPI.MIN))] = np.arange(count)
+    place[over_all(grid.comm, first, MPI.MIN).argsort()] = np.arange(count)
     out[cells] = place[own] + 1
     return out, count
 
@@ -97,7 +108,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
     """Return the connected component of each row, from 0, by common columns, and their number; no row is empty."""
     n = sum(shape)
-    pairs = coo_array((np.ones(len(rows), dtype=np.int8), (rows, shape[0] + columns)), shape=(n, n))
+    pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
     return part[: shape[0]].astype(np.int64), count
 
@@ -115,7 +126,7 @@ def _over_processes(
     index, copy = np.split(grid.node_places(nodes), [grid.dim], axis=1)
     shared = np.zeros(len(nodes), dtype=bool)
     for bits in corner_bits(grid.dim):
-        cell = grid.number(np.clip(index - bits, 0, grid.shape - 1)) + copy[:, 0] * grid.cells
+        cell = grid.number(np.minimum(np.maximum(index - bits, 0), grid.shape - 1)) + copy[:, 0] * grid.cells
         shared |= grid.owner(cell) != grid.comm.rank
     number = np.ravel_multi_index(tuple(index[shared].T), tuple(grid.shape + 1)) + copy[shared, 0] * grid.nodes
     pairs = np.concatenate(grid.comm.allgather(np.stack([start + of_node[shared], number], axis=1)))

@@ -127,7 +127,7 @@ class _Around:
         local = np.where(number >= 0, grid.local(np.maximum(number, 0)), -1)
         local[local >= grid.num_owned] = -1
         own = local >= 0  # may be empty
-        local[own] = np.where(on_grid.active[local[own]], local[own], -1)
+        local[own] = np.where(on_grid.active.contains[local[own]], local[own], -1)
         out, (probe, place) = np.zeros((*local.shape, rows.shape[1])), np.nonzero(local >= 0)
         out[probe, place] = rows[contents.slot(local[probe, place])]
         return local, over_all(grid.comm, out)

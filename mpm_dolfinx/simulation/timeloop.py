@@ -178,8 +178,8 @@ def run(
             _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
                 _observe(observer, simulation, comm)
-            _note(simulation, stopwatch.read(simulation.state.result))
             if checkpoint is not None:
+                _note(simulation, stopwatch.read(simulation.state.result))
                 checkpoint(simulation)
 
     # messages appear above the bar

@@ -75,7 +75,7 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 """See `OnGrid.as_reset`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Errors:
     """Relative residuals of momentum and storage in the parts of the bodies; arrays (parts,).
 
@@ -90,12 +90,12 @@ class Errors:
     start: NDArray[np.float64]
     fluid: StorageResidual | None
 
-    @property
+    @cached_property
     def each(self) -> NDArray[np.float64]:
         """The larger residual of each part."""
         return np.maximum(self.u, self.p)
 
-    @property
+    @cached_property
     def worst(self) -> float:
         """The largest residual."""
         return float(self.each.max(initial=0.0))
@@ -133,10 +133,11 @@ def solve_substep(
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
     serves = report.newton > 0 and momentum.smooth
-    errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
-    took = newton.report
-    if took.newton and storage is None and solvers.plan.symmetric and not solvers.plan.iterative:
-        newton.check_stable()
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual reveals a failed solve
+        errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
+        took = newton.report
+        if took.newton and storage is None and solvers.plan.symmetric and not solvers.plan.iterative:
+            newton.check_stable()
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
     count, most = (took.coupling, "coupling") if in_turn else (took.newton, "newton")
@@ -211,7 +212,7 @@ class Newton:
         self._storage = storage
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
-        forms, active = momentum.forms, momentum.forms.active
+        forms, active = momentum.forms, momentum.forms.active.now
         self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
@@ -276,9 +277,8 @@ class Newton:
         """
         errors, start = self._errors(), self._iterate()
         guesses = [] if self._linear else self._momentum.guesses()
-        at = start[0]
+        at = last = start[0]
         least = errors.u
-        last = start[0]
         for guess in guesses:
             self._go_to([guess, *start[1:]])
             last = None
@@ -303,7 +303,7 @@ class Newton:
     def _parts(self) -> NDArray[np.int64]:
         """Parts of the active degrees of freedom."""
         momentum = self._momentum
-        return momentum.system.parts.nodes[momentum.forms.active.dofs // momentum.forms.grid.dim]
+        return momentum.system.parts.nodes[momentum.forms.active.now.dofs // momentum.forms.grid.dim]
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
         """Set (u, p)."""
@@ -337,8 +337,7 @@ class Newton:
                 raise NotConverged(f"the {name} iteration diverges ({why})", report.history) from failed
             with Timer("mpm: linear solve"):
                 dp = self._solvers.solve_storage()
-            with _ignored():
-                self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
+            self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
             if self._storage.settle():
                 self._linearise()
@@ -376,11 +375,9 @@ class Newton:
             r, forces = self._momentum.residual_of_parts()
             forces = forces if start is None else np.maximum(start, forces)
             u, error_u = self._momentum.out_of_balance(r, forces, first)
-            p = np.zeros_like(u)
-            error_p = np.zeros_like(u)
-            exchanged = np.zeros_like(u)
-            fluid = None
-            size = 0.0
+            exchanged = np.zeros(len(u))
+            p = error_p = exchanged
+            fluid, size = None, 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 exchanged, size = fluid.exchanged, float(fluid.off.sum())
@@ -433,7 +430,7 @@ class Newton:
             if not slow or self._linear or self._storage.forms.retains:
                 return self._solvers.solve(self._kept, rtol, *measures)
             forms = self._momentum.forms
-            slope = self._storage.flux_slope(forms.u, self._momentum.system.unknowns, forms.active.dofs)
+            slope = self._storage.flux_slope(forms.u, self._momentum.system.unknowns, forms.active.now.dofs)
             count = self._solvers.solve(self._kept, rtol, *measures, slope)
             self._storage.set_fluxes()
             return count
@@ -442,19 +439,17 @@ class Newton:
         """Move against the direction, each part by the step length of `search`; return the errors there."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        first = self._work()
-        if not elastic and (first < 0).any():
+        first = np.full(of.count, np.nan) if elastic else self._work()  # without yield it is not asked for
+        if (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
-        searches = {
-            part: Halving() if elastic else Search() for part in np.flatnonzero(before.each > self._scheme.tolerance)
-        }
+        begun = Halving() if elastic else Search()
+        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], begun)
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
-            with _ignored():
-                growth, work = errors.each / before.each, self._work()
+            growth, work = errors.each / before.each, first if elastic else self._work()
             for part, search in list(searches.items()):
                 then = search.after(np.nan if why else _ratio(work[part], first[part]), growth[part])
                 if then is not None:
@@ -490,17 +485,11 @@ class Newton:
 
     def _move(self, steps: NDArray[np.float64]) -> None:
         """Move the parts by fractions (parts,) of the direction."""
-        with _ignored():
-            system = self._momentum.system
-            system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
-            if self._storage is not None:
-                system = self._storage.system
-                system.unknowns.add(self._storage.forms.p, steps[system.of_parts.of], self._solvers.dp)
-
-
-def _ignored() -> np.errstate:
-    """Return a context without floating-point warnings: the residual reveals a failed solve."""
-    return np.errstate(invalid="ignore", over="ignore")
+        system = self._momentum.system
+        system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
+        if self._storage is not None:
+            system = self._storage.system
+            system.unknowns.add(self._storage.forms.p, steps[system.of_parts.of], self._solvers.dp)
 
 
 def _ratio(part: float, whole: float) -> float:

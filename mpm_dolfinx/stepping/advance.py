@@ -126,7 +126,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                followed = cut.followed(nodal, on_grid.active)
+                followed = cut.followed(nodal, on_grid.active.contains)
                 points, keeps, folded = self._shaped(state, loads, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
@@ -188,7 +188,7 @@ class Motion:
             return None
         cut = on_grid.cut
         kept = np.unique(cut.cells[cut.to_cells(keeps)])
-        return np.where(np.repeat(self._momentum.active_nodes(kept), cut.grid.dim), values, 0.0)
+        return np.where(self._momentum.active_nodes(kept).repeat(cut.grid.dim), values, 0.0)
 
     def pressures(
         self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
@@ -316,7 +316,7 @@ class Motion:
         forms = self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
         at = on_grid.contents.slot(cut.cells)
-        volume = on_grid.contents.total(cut.cells, here)[at]
+        volume = on_grid.contents.total(here)[at]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
         density = np.exp((p + p_n) / (2 * forms.bulk))
         dp, density, inflow_here = map(cut.to_pieces, (p - p_n, density, density * net_inflow[at] / volume))
@@ -369,7 +369,7 @@ class Motion:
         """Refuse states that a law may allow but a body cannot have: inverted points, pores without volume."""
         wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
-        bad = np.flatnonzero(~(J > least))
+        bad = (~(J > least)).nonzero()[0]
         if over_all(cut.grid.comm, len(bad)):
             shown = [f"point {points.id[i]} at {points.x[i] + cut.grid.base} with J = {J[i]:.3g}" for i in bad[:1]]
             what = "the pores have closed" if wet else "the body is inverted"
@@ -424,7 +424,7 @@ def untangled(
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
     """Return corners (n, 2^d, d), m; corners of inverted domains are re-initialised from F."""
-    at = np.flatnonzero(bad)
+    at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim
     volume0 = volumes(X) if grid.axisymmetric else points.volume0[at]
@@ -433,5 +433,5 @@ def untangled(
     for one in loads:
         new = one.under_held(points.id[at], corners[at], volume0 * determinant(F), new)
     out = corners.copy()
-    out[at] = np.clip(new, grid.low, grid.high)
+    out[at] = np.minimum(np.maximum(new, grid.low), grid.high)
     return out

@@ -35,7 +35,6 @@ from mpm_dolfinx.mechanics.ghost_penalty import FULL, stiffness
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.parts import parts_of_cells
 from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
@@ -86,15 +85,13 @@ class OnGrid(Keyed):
         moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
         own, slots = self._places.pieces.filled, self._places.pieces.slots
         contents = (sum_by(slots, rows, len(own)) for rows in (area, *moduli))
-        self.cells = momentum.set_contents(own, *contents)
-        """Local cells that contain material, ghosts included."""
-        self.active = np.zeros(grid.num_local, dtype=bool)
-        """Whether each local cell contains material."""
-        self.active[self.cells] = True
+        self.active = momentum.set_contents(own, *contents)
+        """The cells that contain material."""
+        self.cells = self.active.cells
         self.fill = np.zeros(grid.num_local)
         """Volume fraction of the local cells."""
         self.fill[self.cells] = momentum.ghost.fill.x.array[self.cells]
-        self.facets = grid.interior_facets(self.active, self.cells)
+        self.facets = self.active.facets
         """Faces of this process between two active cells."""
         self.penalised = momentum.ghost.facets(self.facets)
         """Faces with a ghost penalty."""
@@ -194,7 +191,7 @@ class OnGrid(Keyed):
             full = partial(materials.saturations, rows[at])
             return PoreWater(full, at, share * store[at], share * pores[at], bulk, scale)
 
-        owner = np.searchsorted(points.id, old.id)
+        owner = points.id.searchsorted(old.id)
         there = pressure_of(pi, bulk)
         held = of_points(owner, old.fraction).of_cells(old.pressure)
         more = of_points(pieces.point, pieces.fraction).level(held, np.zeros(count), there)
@@ -209,11 +206,11 @@ class OnGrid(Keyed):
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
         """Give the integration points at the reset of the grid; within the context u is 0, and p as then."""
-        at = [(self._u.x.array, self._momentum.active.dofs)]
+        at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
         now = [values[rows] for values, rows in at]
-        self._u.x.array[self._momentum.active.dofs] = 0.0
+        self._u.x.array[self._momentum.active.now.dofs] = 0.0
         if self._storage is not None:
             if state.stay:
                 self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
@@ -239,10 +236,10 @@ class OnGrid(Keyed):
 
         The weight is the storage, or the volume in a cell without storage.
         """
-        contents, cells = self.contents, self.cut.cells
+        contents = self.contents
         potential, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
-        held, mean = contents.total(cells, store), contents.mean(potential)
-        return np.divide(contents.total(cells, store * potential), held, out=mean, where=held > 0)
+        held, mean = contents.total(store), contents.mean(potential)
+        return np.divide(contents.total(store * potential), held, out=mean, where=held > 0)
 
     def pressures_at_pieces(
         self,
@@ -269,9 +266,9 @@ class OnGrid(Keyed):
         offset = pieces.places.offset
         at = contents.slot(pieces.cells)
         store = self.cut.pieces_to_cells(store)
-        weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
-        total = contents.total(cells, weight)
-        origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
+        weight = np.where(contents.total(store)[at] > 0, store, self.weight)
+        total = contents.total(weight)
+        origin = np.stack([contents.total(weight * x) / total for x in offset.T], axis=1)
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
@@ -300,7 +297,7 @@ class OnGrid(Keyed):
         """Return the correction of the volume defect in the filled owned cells in a step, m^d."""
         cut, due = self.cut, state.points.volume0 * state.points.data["due"]
         share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
-        return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
+        return self.contents.total(self.data.pieces["biot"][:, 0] * share)
 
     def pressures_up_to_surface(
         self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
@@ -406,7 +403,7 @@ class OnGrid(Keyed):
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
-        return np.flatnonzero(self.contents.total(self.cut.cells, moves) == 0)
+        return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return whether each point (n,) stays in its cut: its part hardly moves; groups are tested together."""
@@ -417,17 +414,12 @@ class OnGrid(Keyed):
         return self.cut.valid(points, part, count)[part]
 
     @cached_property
-    def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Connected part (cells,) of each local cell, from 1, 0 for empty ones; and the number of parts."""
-        return parts_of_cells(self.cut.grid, self.active)
-
-    @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
         """Connected part (n,) of each point, from 0, and the number of parts.
 
         The unknowns of a part are independent of all other parts.
         """
-        part, count = self.parts_of_cells
+        part, count = self.active.parts_of_cells
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -471,7 +463,8 @@ class System:
         self._scheme = scheme
         self.symmetric = symmetric
         self.storage = None
-        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(*on_grid.parts_of_cells)
+        own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
+        parts = momentum.parts(*on_grid.active.parts_of_cells)
         self.momentum = MomentumSystem(momentum, dofs, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -524,7 +517,7 @@ class Assembled(Keyed):
         self.plan = system.plan
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
-        self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
+        self._nodal, self._varies = momentum.nodal, storage is not None and storage.conductivity is not None
         self._bulk = storage.bulk if storage is not None else np.inf
         by_pressure = on_grid.mixes or (self._varies and storage.conductivity.by_pressure)
         self._by_pressure = storage.p_before if by_pressure else None
@@ -589,7 +582,7 @@ class Assembled(Keyed):
         on_grid = self._on_grid
         contents = self._on_grid.contents
         grid = self._on_grid.cut.grid
-        u = self._u
+        u = self._nodal
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may depend on time
         wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None, dt, state.outcome)
@@ -623,7 +616,7 @@ class Assembled(Keyed):
         at_u = (data.pieces.key, weight, *varies)
 
         def outflow(begins: bool) -> Outflow:
-            nodal = contents.nodal(u.x.array.reshape(-1, grid.dim))
+            nodal = contents.nodal(u)
             return self._outflow((*at_u, nodal), lambda: at_present(nodal, begins), grid.comm)
 
         return feeds, outflow
@@ -647,7 +640,7 @@ def assembled(
         A body, or at the start of a stage a part of one, has a free rigid-body mode.
     """
     grid, free = on_grid.cut.grid, stage.free
-    dofs = momentum.active.dofs[free[momentum.active.nodes].ravel()]
+    dofs = momentum.active.now.dofs[free[momentum.active.now.nodes].ravel()]
     stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
 
     def make() -> System:

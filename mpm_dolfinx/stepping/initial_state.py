@@ -61,9 +61,9 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
         cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
     )  # potentials are additive in a cell
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
-    held = contents.total(cut.cells, store)
+    held = contents.total(store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
-    mean = contents.total(cut.cells, weight * pi) / contents.total(cut.cells, weight)
+    mean = contents.total(weight * pi) / contents.total(weight)
     wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
     pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
     p = pressure_of(pi, bulk)

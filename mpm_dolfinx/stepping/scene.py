@@ -129,20 +129,8 @@ class Scene:
             law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
             kind = (symmetric, scene.conducts, scene.evolves)
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
-            forms = (
-                pieces,
-                u,
-                p,
-                self.momentum.active,
-                fluid.bulk,
-                weight,
-                *kind,
-                law,
-                feeding,
-                inertial,
-                scene.retentions,
-            )
-            self.storage = StorageForms(*forms)
+            of_fluid = (fluid.bulk, weight, *kind, law, feeding, inertial, scene.retentions)
+            self.storage = StorageForms(pieces, u, p, self.momentum.active, *of_fluid)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # pending checks for warnings, which affect the log only
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -187,9 +175,9 @@ class Scene:
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
             self.gravity.value = when.gravity
-        self.momentum.velocity.set(when.own, when.past, self.momentum.active.dofs)
+        self.momentum.velocity.set(when.own, when.past, self.momentum.active.now.dofs)
         if self.storage is not None:
-            cells = self.momentum.active.cells
+            cells = self.momentum.active.now.cells
             self.storage.p_before.x.array[cells] = self.storage.p.x.array[cells]
         if u is not None:
             self.momentum.u.x.array[:] = u

@@ -178,8 +178,10 @@ class Stage:
 
     def kinetic(self, outcome: Outcome) -> float:
         """Return the kinetic energy, J, of free tools from an outcome."""
-        velocity = outcome.get("tool_velocity", {})
-        return sum(self.named[name].mass / 2 * float(v @ v) for name, v in velocity.items() if name in self.named)
+        d, tools = self.free.shape[1], self.of(Tool)
+        moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
+        moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
+        return sum(m / 2 * float((v**2).sum()) for m, v in moving)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""

@@ -27,7 +27,7 @@ def _freeze(kept: Mapping[str, Any]) -> None:
     for values in kept.values():
         if isinstance(values, np.ndarray):
             values.flags.writeable = False
-        elif isinstance(values, Mapping):
+        elif isinstance(values, dict):
             _freeze(values)
 
 

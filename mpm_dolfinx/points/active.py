@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""Active part of a grid: a step only touches cells with material, for any size of the box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.points.parts import parts_of_cells
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveSet:
+    """The active cells of a grid, and all that follows from them.
+
+    cells, nodes: local numbers, ascending, ghosts included: active cells, and nodes of active cells of any process.
+    """
+
+    grid: Grid
+    cells: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+
+    @cached_property
+    def dofs(self) -> NDArray[np.int64]:
+        """Unrolled degrees of freedom of the nodes."""
+        return (self.nodes[:, None] * self.grid.dim + np.arange(self.grid.dim)).ravel()
+
+    @cached_property
+    def contains(self) -> NDArray[np.bool_]:
+        """Whether each local cell is active."""
+        out = np.zeros(self.grid.num_local, dtype=bool)
+        out[self.cells] = True
+        return out
+
+    @cached_property
+    def facets(self) -> NDArray[np.int32]:
+        """Faces of this process between two active cells."""
+        return self.grid.interior_facets(self.contains, self.cells)
+
+    @cached_property
+    def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
+        """Connected part (cells,) of each local cell, from 1, 0 for empty ones; and the number of parts."""
+        return parts_of_cells(self.grid, self.contains)
+
+
+class Active:
+    """The cells with material since the last grid reset, and their nodes.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    wet
+        Whether cells may contain fluid.
+    cells, dofs
+        Local arrays by cells, and by unrolled degrees of freedom, that are zero outside the active part.
+
+    Attributes
+    ----------
+    now
+        The active set, one object while the cells stay the same.
+    slot : (cells,)
+        Index of each cell among the owned active ones.
+    centroid, opening : (cells, d), (cells, d, 2)
+        Offsets of the centroids of the contents from the midpoints, m, and open fractions of faces.  Empty without
+        fluid, like `slot`.
+    """
+
+    def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):
+        self._grid, d = grid, grid.dim
+        count = grid.num_local if wet else 0
+        self.slot = np.zeros(count, dtype=np.int64)
+        self.centroid, self.opening = np.zeros((count, d)), np.zeros((count, d, 2))
+        self._last: Latest[ActiveSet] = Latest()
+        self.set(np.empty(0, dtype=np.int64), lambda: np.empty(0, dtype=np.int64))
+        self._of_cells = (*cells, *[self.centroid, self.opening] * wet)
+        self._of_dofs = tuple(dofs)
+
+    def clear(self) -> None:
+        """Reset the arrays to zero, before other cells become active."""
+        for rows, arrays in ((self.now.cells, self._of_cells), (self.now.dofs, self._of_dofs)):
+            for values in arrays:
+                values[rows] = 0.0
+
+    def set(self, cells: NDArray[np.int64], nodes: Callable[[], NDArray[np.int64]]) -> None:
+        """Set the active cells; nodes: function that returns their nodes.  The call is collective."""
+        self.now = self._last(cells, lambda: ActiveSet(self._grid, cells, nodes()), self._grid.comm)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: MIT
+"""Calls of Python functions in a step: they take most of the time of small scenes."""
+
+import sys
+
+import pytest
+from helpers import beam
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
+
+
+def block():
+    """Return a draining block of 10 x 10 cells, pressed so much that each step resets the grid."""
+    grid = mpm.Grid([0, 0], [1, 1.2], [10, 12])
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    body = mpm.box(grid, [0, 0], [1, 1])
+    return mpm.Simulation(grid, [body], [SOIL], fluid=mpm.Fluid(), walls=walls, conditions=[load, mpm.Drained("top")])
+
+
+def dry_beam():
+    """Return a dry cantilever, which bends into other cells in each step."""
+    return beam(fluid=False, ramp=1.0)[0]
+
+
+def calls(run):
+    """Return the number of calls of Python functions."""
+    count = 0
+
+    def seen(frame, event, argument):
+        nonlocal count
+        count += event == "call"
+
+    sys.setprofile(seen)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+@pytest.mark.parametrize(
+    ("scene", "newton", "most"), [(block, 6, 4900), (dry_beam, 5, 3200)], ids=["draining block", "dry beam"]
+)
+def test_a_step_calls_no_more_functions_than_before(scene, newton, most):
+    """These ceilings only fall.  They count numpy's own functions, of which newer releases need fewer."""
+    s, reports = scene(), []
+
+    def steps(count):
+        reports.extend(s.step(0.1) for _ in range(count))
+
+    steps(2)
+    made = calls(lambda: steps(4)) / 4
+    assert [report.newton for report in reports[2:]] == [newton] * 4, "other Newton steps cost other calls"
+    assert made <= most
