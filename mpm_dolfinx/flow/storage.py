@@ -603,12 +603,7 @@ class StorageProblem:
         r.array_w[:] = mass / density
         # bound of rounding errors: of volumes, and of fluxes that cancel
         round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
-        rows = (
-            np.abs(change) + now.gain + before.gain,
-            round_off,
-            np.abs(mass),
-            change + now.net + before.net,
-        )
+        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.net + before.net
         return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
@@ -619,12 +614,10 @@ class StorageProblem:
             fluid = fluid._replace(force=self._inertial())
             force = self._local(fluid.force)
         if system.gravity is None:
-            cells = system.between(fluid.pi) + self._correction
+            cells = system.between(fluid.pi)
         else:
-            cells = (
-                self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
-                + self._correction
-            )
+            cells = self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
+        cells = cells + self._correction
         net, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):

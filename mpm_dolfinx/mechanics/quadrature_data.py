@@ -184,9 +184,8 @@ class QuadraturePoints:
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         if self._locks and cut.domains:
-            share = self._scene.locking(points) * self._scene.table(
-                points, lambda m: corner_share(m, bool(self._fluid))
-            )
+            share = self._scene.table(points, lambda m: corner_share(m, bool(self._fluid)))
+            share = self._scene.locking(points) * share
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
             if ACROSS in fields:
