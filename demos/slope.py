@@ -98,7 +98,8 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
     """Draw the overloads of the trials, and the slope before and after its slide."""
     fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
     for factor, shares in sorted(safety.overloads.items()):
-        style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
+        rests = factor <= safety.bounds[0]
+        style = {"color": "C0" if rests else "C1", "marker": "o" if rests else "x", "ms": 4, "lw": 1}
         trials.semilogy(np.arange(1, len(shares) + 1), shares, **style)
         trials.annotate(
             f"{factor:.3f}", (len(shares), shares[-1]), fontsize=8, xytext=(3, 0), textcoords="offset points"
@@ -106,7 +107,7 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
     trials.set(
         xlabel="step",
         ylabel="overload (share of the shear stress)",
-        title=f"Factor of safety {safety.factor:.3f}; green: comes to rest, red: fails",
+        title=f"Factor of safety {safety.factor:.3f}; dots: comes to rest, crosses: fails",
     )
     trials.margins(x=0.12)
     quads = common.domains(after, corners, moved, cmap="viridis", linewidth=0.1)

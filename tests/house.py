@@ -243,8 +243,8 @@ def _slot(index: ast.AST) -> bool:
 def hidden() -> list[str]:
     """Return where a method changes the contents of its object without setting an attribute, or a function a global.
 
-    self.x[0] += 1, self.x[:] = y, self.x[()] = y; self._x.append, clear, update, pop and add outside of __init__;
-    `global`; attributes of functions; names of a module's own lists and dictionaries whose entries are set.
+    These are: `self.x[0] += 1`, `self.x[:] = y`, `self.x[()] = y`; `self._x.append`, clear, update, pop and add
+    outside of `__init__`; `global`; attributes of functions; entries set in a module's own lists and dictionaries.
     """
     out = []
     for module in modules():

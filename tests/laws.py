@@ -50,7 +50,7 @@ class LawAtPoints:
         taken = {
             name: value
             for name, value in {"F": self.F, **self.values}.items()
-            if name in self.law.taken_by(self.law.update)
+            if name in self.law.arguments_of(self.law.update)
         }
         new = {name: ufl.as_ufl(value) for name, value in self.law.update(**taken).items()}
         parts = [value[i] if i else value for value in new.values() for i in np.ndindex(value.ufl_shape)]

@@ -107,7 +107,7 @@ SCENES = {
     "dry": (wetted, 25, 50),
     "flow": (flowing, 8, 16),
 }
-"""Scenes with their cells: those in which a number is varied, and finer ones."""
+"""Scenes with their cells: the ones in which a number is varied, and finer ones."""
 
 
 def holders(where: str, name: str) -> list:

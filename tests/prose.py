@@ -4,15 +4,17 @@
     python -m tests.prose --show PART               # the long and the vague sentences of a part
     python -m tests.prose --draw 300 --seed 1       # sentences drawn at random, with their places, for a reader
 
-Text is that of docstrings and of pages without code, tables' rules, comments and formulas.  Code in a sentence counts
-as one word.  *Vague* words are those behind which a noun is missing or far away.  A sentence ends at a full stop, a
-colon, or at the end of a paragraph, of an item or of a cell of a table.
+The text comes from docstrings, and from pages without code, tables' rules, comments and formulas.  Code in a sentence
+counts as one word.  The noun of a *vague* word is missing or far away.  A sentence ends at a full stop or a colon, and
+with its paragraph, item or cell of a table.
 """
 
 import ast
 import re
 import sys
 from argparse import ArgumentParser
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from random import Random
 from statistics import median
@@ -21,6 +23,12 @@ ROOT = Path(__file__).parents[1]
 VAGUE = re.compile(r"\b(what|those|beside|besides|of which)\b", re.IGNORECASE)
 LONG = 25
 """Words of the longest sentence that is easily read."""
+PRIVATE = set(
+    "told tells came owed said says apart beside amiss gone felt aslant lies foot offence begun began aloud loud mine "
+    "lone sought borne fall falls rise rises way ways reach room travel drives resists stays taken spread turned turns "
+    "met meets passed here there went back lost due wanted asked".split()
+)
+"""Verbs, participles and adverbs that name values in place of a noun of the field."""
 ENTRY = re.compile(r"^( *)(\S.{0,60}[^.:\s])\n\1 {4}(?=\S)", re.M)
 """A name of a list of parameters, and its text below."""
 SHORTEST = 4
@@ -121,6 +129,22 @@ def poor(texts: list[str]) -> list[str]:
     return out
 
 
+def private_names(trees: Iterable[ast.AST]) -> Counter[str]:
+    """Return how often functions, fields, attributes, parameters and variables have a private name."""
+    out: Counter[str] = Counter()
+    for node in (node for tree in trees for node in ast.walk(tree)):
+        stored = isinstance(getattr(node, "ctx", None), ast.Store)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            name = node.name
+        elif isinstance(node, ast.arg):
+            name = node.arg
+        else:
+            name = getattr(node, "id", getattr(node, "attr", "")) if stored else ""
+        if name.strip("_").lower() in PRIVATE:
+            out[name.strip("_").lower()] += 1
+    return out
+
+
 def whole_sentences(paragraph: str) -> list[str]:
     """Return the sentences of a paragraph as they stand, of at least `SHORTEST` words without code.
 
@@ -179,3 +203,7 @@ if __name__ == "__main__":
     for part, found in PARTS.items():
         m = measures(found())
         print(f"{part:12} {m['words']:7d} {m['vague']:11.2f} {m['long']:7.2f} {m['median']:7.0f}")
+    names = private_names(ast.parse(path.read_text()) for path in files("mpm_dolfinx"))
+    print(
+        f"private names in the package: {names.total()}:", ", ".join(f"{name} {n}" for name, n in names.most_common())
+    )

@@ -111,4 +111,4 @@ def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
 def test_a_body_along_the_grid_has_no_flow_besides():
     s, _ = turned(8, 0.0, [(1, 0.0)], off=0.3, pressure=START)
     s.run(1e4, 1e4, progress=False)
-    assert not s.scene.storage.fluxes.aslant.used
+    assert not s.scene.storage.fluxes.nonorthogonal.used

@@ -47,7 +47,7 @@ SOIL = mpm.BarcelonaBasic(**CONSTANTS, r=R, beta=BETA, reference=REFERENCE)
 
 
 def wetted(suctions, net=NET):
-    """Return ln J, and ln of P_c0 over that at the start, along suctions at a net stress, all isotropic.
+    """Return ln J, and ln of P_c0 over its initial value, along suctions at a net stress, all isotropic.
 
     ln J = -kappa ln(P / P_0) - (lambda(0) - kappa) ln(P_c0 / P_c0 at the start), P = J (net + chi s) at most P_c(s).
     """
@@ -243,7 +243,7 @@ def layers(axisymmetric, other):
     ids=["beside clay", "axisymmetric, beside elastic soil"],
 )
 def test_the_tangent_has_what_stresses_change_by_with_suction(axisymmetric, other):
-    """Beside differences, of soil that collapses; without it the forces are off by more than half."""
+    """Compared with differences, for soil that collapses; without it the forces are off by more than half."""
     s, rng = layers(axisymmetric, other), np.random.default_rng(3)
     _, momentum, storage = set_up(s, 1e-6)
     u, p = momentum.system.unknowns, storage.system.unknowns
@@ -289,7 +289,7 @@ def test_soil_under_its_weight_is_at_rest_with_its_suction():
 
 
 def test_it_shows_the_same_in_any_frame():
-    """In other units, mirrored, carried, cut at a checkpoint, beside a far body, in another order."""
+    """In other units, mirrored, carried, cut at a checkpoint, with a far body, in another order."""
     law = {"M": 1.1, "lambda_": 0.08, "kappa": 0.015, "shear": 2e6, "initial_stress": (-6e4,) * 3, "porosity": 0.4}
     law |= {"r": 0.4, "beta": 4e-5, "reference": 3e3, "conductivity": 1e-7}
     law |= {"retention": ("VanGenuchten", {"entry": 2e4, "n": 1.8})}
@@ -318,7 +318,7 @@ def test_a_sample_that_may_vibrate_collapses_as_far():
 
 @dataclass(frozen=True)
 class Swelling(mpm.Hencky):
-    """Soil that swells by ln J = swell times what its suction has fallen by, without stress."""
+    """Soil that swells by ln J = swell times the decrease of its suction, without stress."""
 
     state: ClassVar = {"suction": 0.0}
     swell: mpm.Field = 1e-6

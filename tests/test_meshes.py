@@ -579,3 +579,12 @@ def test_holes_are_sides_and_other_gmsh_models_stay():
 def test_domains_that_are_far_too_small_are_named(warned):
     mpm.from_mesh(GRID, box_mesh("quad", (100, 2), (0, 0), (0.2, 0.002)))
     assert "smaller than 0.2 of the grid's resolution" in warned()[0]
+
+
+def test_a_polygon_warns_of_small_domains_for_a_given_size_only(warned):
+    pytest.importorskip("gmsh")
+    grid, wedge = mpm.Grid([0, 0], [20, 12], [40, 24]), [[0, 0], [20, 0], [0, 8]]
+    mpm.polygon(grid, wedge, "side")
+    assert not warned()
+    mpm.polygon(grid, wedge, "side", size=0.25)
+    assert "smaller than 0.2 of the grid's resolution" in warned()[0]

@@ -10,7 +10,7 @@ from mpi_following import pushed
 from test_many_sizes import EXACT, KINDS, at_random
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.domains.cut_domains import STAYS
+from mpm_dolfinx.domains.cut_domains import STILL
 from mpm_dolfinx.grid.following import carried
 from mpm_dolfinx.grid.grid import SIDES
 
@@ -120,11 +120,11 @@ def test_scenes_in_turn_on_one_grid_do_not_disturb_each_other():
 
 
 def test_a_step_keeps_its_cut_by_the_cells_where_it_moves():
-    """A block that is moved by half of STAYS of the coarse cells keeps its cut there; in fine cells it does not."""
+    """A block that is moved by half of STILL of the coarse cells keeps its cut there; in fine cells it does not."""
     kept, y = [], np.append(np.linspace(0, 0.1, 21), np.linspace(0.2, 1.2, 11))
     for low, high in ((0.02, 0.08), (0.5, 0.9)):
         grid = mpm.Grid(lines=[np.array([0, 0.1]), y])
-        hold = mpm.Displacement("bottom", (0, 0.5 * STAYS * 0.1))
+        hold = mpm.Displacement("bottom", (0, 0.5 * STILL * 0.1))
         body = mpm.box(grid, [0, low], [0.1, high])
         s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "x", "right": "x"}, conditions=[hold])
         s.step(1.0)

@@ -142,8 +142,8 @@ def test_what_fluxes_gain_by_displacements_is_what_their_residual_does():
     storage.assemble_tangent()
     out, content, there = system.unknowns.vector(), system.unknowns.vector(), []
     slope = storage.flux_slope(u, unknowns, momentum.forms.active.now.dofs)
-    system.lost(v, out, slope)
-    system.lost(v, content)
+    system.change_by(v, out, slope)
+    system.change_by(v, content)
     for step in (1e-6, -2e-6):
         move(v, step)
         there.append(storage.assemble_residual().vector.array.copy())

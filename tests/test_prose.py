@@ -16,6 +16,9 @@ CEILINGS = {  # vague words in 1000, and long sentences in 100: lowered with wha
 }
 
 
+PRIVATE_NAMES = 261  # of the package: lowered with each that is renamed
+
+
 @pytest.mark.parametrize("part", prose.PARTS)
 def test_prose_is_not_above_its_ceiling(part):
     found, (vague, long) = prose.measures(prose.PARTS[part]()), CEILINGS[part]
@@ -41,3 +44,13 @@ def test_drawn_sentences_stand_where_they_are_said_to():
         below = " ".join((prose.ROOT / path).read_text().splitlines()[int(line) - 1 :])
         words = [re.findall(r"[^\W\d_]+", re.sub(r"`.*?`", "", text)) for text in (sentence, below)]
         assert set(words[0]) <= set(words[1])
+
+
+def test_private_names_only_become_fewer():
+    names = prose.private_names(prose.ast.parse(path.read_text()) for path in prose.files("mpm_dolfinx"))
+    assert names.total() <= PRIVATE_NAMES
+
+
+def test_private_names_of_functions_fields_parameters_and_variables_are_counted():
+    code = "class A:\n    told: int\n    def _came(self, way, path):\n        self.gone = path.gone\n        lost = way"
+    assert dict(prose.private_names([prose.ast.parse(code)])) == {"told": 1, "came": 1, "way": 1, "gone": 1, "lost": 1}

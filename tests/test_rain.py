@@ -162,7 +162,7 @@ def test_a_resumed_run_goes_on_as_the_one_that_was_not_broken_off(tmp_path):
 
 
 def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirror=False, swapped=False, far=False):
-    """Return pressures of cells and outflows of sand beside loam in rain that swings, in the units of the first."""
+    """Return cell pressures and outflows of sand next to loam in oscillating rain, in the units of the first."""
     gravity = 9.81 * length / time**2
     density = 1000 * stress * time**2 / length**2
     lower = np.multiply(at, length / 10)

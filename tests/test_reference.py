@@ -104,7 +104,7 @@ def across(fem, z):
 
 @pytest.mark.parametrize("element", [pytest.param("taylor-hood", marks=pytest.mark.slow), "q1-dg0"])
 def test_unsaturated_soil_consolidates_by_elements_as_its_linear_theory_says(element):
-    """Of second order in h; beside material points on the same grid."""
+    """Of second order in h; compared with material points on the same grid."""
     exact, off = Pressed(), []
     for cells in (10, 20):
         fem, z = elements(cells, exact.soil, exact.sides, -20e3, element, numerics=mpm.Numerics(tolerance=1e-11))
@@ -145,7 +145,7 @@ def test_a_front_runs_into_dry_soil_by_elements_as_by_material_points():
 @pytest.mark.slow
 @pytest.mark.parametrize("element", ["taylor-hood", "q1-dg0"])
 def test_soil_under_hydrostatic_suction_settles_by_elements_under_the_weight_of_its_water(element):
-    """Sealed but for its base: water is at rest, and strains are those of weight, suction and water."""
+    """Sealed except at its base: water is at rest, and strains follow from weight, suction and water."""
     modulus, law = 1e8, mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
     soil = mpm.LinearElastic(modulus / 3, modulus / 2, porosity=0.4, conductivity=1e-5, retention=law)
     base = mpm.Drained("bottom", pressure=0.3 * WATER)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Domains of yielded soil are renewed as the grid is reset: what they hold, fill and bound stays what it was."""
+"""Renewal of yielded domains at a grid reset keeps their contents, their volume and their surface."""
 
 from dataclasses import replace
 
@@ -136,7 +136,7 @@ def test_elastic_soil_is_left_alone(monkeypatch):
 
 
 def test_pressures_act_on_renewed_sides_as_before(monkeypatch):
-    """On a region of a side too: forces and moments of what acts stay."""
+    """Also on a region of a side, forces and moments of the loads stay the same."""
     load = mpm.Pressure("top", 1e3, region=([0.5, 0], [1.31, 2]))
     s = block([load, mpm.Traction("hole", (100.0, 200.0))], hole=True)
     old = yielded(s, 1e-3 * np.diag([1.0, -1.0]))
@@ -152,7 +152,7 @@ def test_pressures_act_on_renewed_sides_as_before(monkeypatch):
 
 
 def layers(wet):
-    """Return the scene of a rough disc that goes aslant into two layers of clay beside a pressure, dry or wet."""
+    """Return the scene of a rough disc pushed obliquely into two layers of clay, next to a pressure, dry or wet."""
     constants = {"bulk": 5e6, "shear": 1e5, "friction": 0.0, "dilation": 0.0, "porosity": 0.4, "conductivity": 1e-8}
     clay = [("DruckerPrager", constants | {"cohesion": c, "grain_density": 2600.0}) for c in (1e3, 1.5e3)]
     blocks = Block((0.0, 0.0), (1.0, 0.5), 0), Block((0.0, 0.5), (1.0, 0.83), 1)
@@ -167,7 +167,7 @@ def layers(wet):
 
 @pytest.mark.parametrize("wet", [False, True])
 def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet):
-    """Mirrored, turned, carried, in other units and orders, beside a body at rest, and after a restart."""
+    """Mirrored, rotated, carried, in other units and orders, with another body at rest, and after a restart."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
     scene, plain = layers(wet), Frame.plain(2)
     base = run(scene, plain)
@@ -180,7 +180,7 @@ def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet):
 
 
 def test_cells_keep_their_fluid_and_pressure(monkeypatch):
-    """Beside other pressures, and with what is owed to points; but for crumbs of a millionth of a cell."""
+    """Compared with other pressures, and with the volume defect of points, but for crumbs of a millionth of a cell."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
     s = build(layers(True), Frame.plain(2)).simulation
     s.run(4 / 8, 1 / 8, progress=False)

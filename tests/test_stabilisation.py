@@ -33,8 +33,8 @@ class Soil(mpm.LinearElastic):
 def exact(x):
     """Return (displacement, pressure) of an undrained layer of 1 m on a smooth floor, -LOAD cos(K x) on its top.
 
-    Incompressible, u = curl psi, psi = (A sinh Ky + B y cosh Ky) sin Kx, which leaves the floor and, at
-    Kx = 0 and pi, the walls free of shear; A and B from the tractions of the top.
+    Incompressible: u = curl psi, psi = (A sinh Ky + B y cosh Ky) sin Kx.  The floor is free of shear, and so are
+    the walls at Kx = 0 and pi.  A and B follow from the tractions of the top.
     """
 
     def derivatives(y):

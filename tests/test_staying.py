@@ -49,8 +49,8 @@ def cuts(monkeypatch):
 
 def test_the_answer_is_that_of_cutting_in_every_step(cuts, monkeypatch):
     runs = []
-    for stays in (-1.0, cut_domains.STAYS):
-        monkeypatch.setattr(cut_domains, "STAYS", stays)
+    for stays in (-1.0, cut_domains.STILL):
+        monkeypatch.setattr(cut_domains, "STILL", stays)
         s = column(1e4)  # it settles by 3e-3 of a cell
         steps = s.run(40, 0.8, progress=False).steps
         runs.append((s.points.x, s.points.pressure, s.points.F, len(cuts)))

@@ -76,7 +76,7 @@ def test_rain_on_exponential_soil_is_that_of_srivastava_and_yeh():
 
 @pytest.mark.slow
 def test_rain_on_exponential_soil_is_of_second_order_in_the_step():
-    """After 6 h, beside steps of 112.5 s: errors of steps of 900 and 450 s."""
+    """After 6 h: errors of steps of 900 and 450 s, compared with steps of 112.5 s."""
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=1e-5, retention=mpm.Gardner(WATER / 5))
     found = []
     for dt in (900, 450, 112.5):
@@ -104,14 +104,14 @@ def test_a_front_runs_into_dry_soil_as_that_of_celia(cells, front, taken):
 
 
 def test_a_front_runs_in_steps_by_the_error_of_its_water():
-    """Within the same bounds, in about as many steps; errors in time are far below those of the cells."""
+    """Within the same bounds, in about as many steps; errors in time are far below errors of the cells."""
     result = check_celia(25, 1.2e-3, 2.5e-3, rtol=3e-2)
     assert result.steps < 35
     assert result.balance < 1e-8
 
 
 class Celia:
-    """Soil and sides of Celia's column, and what is known after 12 h: 1600 finite volumes, extrapolated."""
+    """Soil and sides of Celia's column, and reference values after 12 h: 1600 finite volumes, extrapolated."""
 
     law = mpm.VanGenuchten(WATER / 3.35, residual=0.102 / 0.368, n=2.0)
     soil = mpm.LinearElastic(**STIFF, porosity=0.368, conductivity=9.22e-5, retention=law)
@@ -257,7 +257,7 @@ def rising(head, k, a, q, z):
 
 @pytest.mark.parametrize(("off", "k", "a"), [(0.0, 10, 2.5), (0.3, 10, 2.5), (0.5, 10, 2.5), (0.7, 100, 1)])
 def test_seepage_through_layers_is_exact_at_any_offset(off, k, a):
-    """Steady, of exponential soils; k, a: the upper one's over those of the lower one."""
+    """Steady flow through exponential soils; k, a: ratios of the upper soil to the lower one."""
     k, a, q, edge = (1e-6, k * 1e-6), (2.0, 2.0 * a), 0.5e-6, 0.5 + off / 20
     given = {"bulk": 1e13, "shear": 5e12, "porosity": 0.4}  # else a millimetre of settlement counts
     soils = [
@@ -395,7 +395,7 @@ def test_suction_is_strength_by_bishops_stress(suction):
 
 
 def test_a_block_with_suction_falls_as_everything_does():
-    """Its weight and its mass are those of soil and water; it keeps its water."""
+    """It has the weight and the mass of soil and water; it keeps its water."""
     soil = mpm.Hencky(1e7, 5e6, porosity=0.4, conductivity=1e-5, retention=mpm.VanGenuchten(2e4, n=2.0))
     grid = mpm.Grid([0, 0], [2, 3], [8, 12])
     scene = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": {}, "pressure": -3e4, "inertia": True}
@@ -429,7 +429,7 @@ def test_water_in_two_soils_that_fall_does_not_flow():
 
 
 def test_a_dry_column_swings_with_the_mass_of_its_water():
-    """Its period is that of soil and of what pores hold, 8 % less than with full ones."""
+    """It has the period of soil and of the water in its pores, 8 % less than with full pores."""
     law, p = mpm.VanGenuchten(1e3, residual=0.3, n=4.0), -1e6
     soil = mpm.LinearElastic(1e7, 5e6, porosity=0.4, retention=law)
     grid = mpm.Grid([0, 0], [0.05, 1.1], [1, 22])

@@ -42,9 +42,9 @@ DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
-_instead: dict[Path, Path] = {}
+_replacements: dict[Path, Path] = {}
 """Temporary folders of this run, by the cache folder that cannot be written."""
-_to_say: dict[Path, str] = {}
+_warnings: dict[Path, str] = {}
 """Warnings by temporary folder, until the first compilation there."""
 
 
@@ -58,15 +58,15 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
         In one line, on all processes: unreadable settings, no writable folder, or a C compiler that fails.
     """
     folder = at_root(comm, _folder)
-    said = [""]
+    messages = [""]
     raised = None
-    makers = {name: _whole(getattr(libraries, name), folder, said) for name in MAKERS}
+    makers = {name: _complete(getattr(libraries, name), folder, messages) for name in MAKERS}
     try:
         with _quiet(), _replaced(**makers):
             yield
     except Exception as error:
         raised = error
-    message = first(comm, said[-1])  # dolfinx tells the other processes only that one has failed
+    message = first(comm, messages[-1])  # dolfinx tells the other processes only that one has failed
     if message:
         raise OSError(message) from raised
     if raised is not None:
@@ -91,9 +91,9 @@ def _folder() -> Path:
         with tempfile.TemporaryDirectory(prefix=WORKSHOP, dir=cache):
             return cache
     except OSError as error:
-        if cache not in _instead:
-            _instead[cache] = _of_this_run(cache, error)
-        return _instead[cache]
+        if cache not in _replacements:
+            _replacements[cache] = _of_this_run(cache, error)
+        return _replacements[cache]
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
@@ -105,18 +105,18 @@ def _of_this_run(cache: Path, why: OSError) -> Path:
     except OSError as error:
         raise OSError(f"{what}, and {line_of(error)}, {allowed}") from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    _to_say[folder] = f"{what}, {allowed}; until then every run compiles anew, in {folder}"
+    _warnings[folder] = f"{what}, {allowed}; until then every run compiles anew, in {folder}"
     return folder
 
 
-def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
+def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
     """Return FFCx's function that makes a library, in a version that only leaves complete libraries behind.
 
     Parameters
     ----------
     folder
         Folder for new libraries.
-    said
+    messages
         List to which errors of compiler and disk are appended.
     """
 
@@ -126,7 +126,7 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
         def look(name: str, names, workshop, timeout):
             for place in dict.fromkeys((Path(cache_dir), folder)):
                 with suppress(OSError, ImportError, AttributeError):  # unreadable, or another file of this name
-                    if _is_whole(place, name):
+                    if _is_complete(place, name):
                         module = _loaded(name, _library(place, name))
                         return [getattr(module.lib, one) for one in names], module
             return find(name, names, workshop, timeout)  # makes the workshop, which is empty
@@ -135,18 +135,18 @@ def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
             with _replaced(get_cached_module=look):
                 out = make(*objects, cache_dir=workshop, **settings)
             if workshop.exists():
-                if folder in _to_say:
-                    logger.warning(_to_say.pop(folder))
+                if folder in _warnings:
+                    logger.warning(_warnings.pop(folder))
                 with suppress(OSError):  # the library is loaded already; a later run compiles it again
                     _publish(workshop, folder)
             return out
         except cffi.VerificationError as error:
             allowed = "must be able to make Python extensions: on Debian, apt install gcc libc6-dev python3-dev"
-            said.append(f"C compiler: {line_of(error)}, {allowed}")
+            messages.append(f"C compiler: {line_of(error)}, {allowed}")
             raise
         except OSError as error:
             allowed = "must be a folder that can be written, with room, or set XDG_CACHE_HOME to another"
-            said.append(f"{folder}: {line_of(error)}, {allowed}")
+            messages.append(f"{folder}: {line_of(error)}, {allowed}")
             raise
         finally:
             shutil.rmtree(workshop, ignore_errors=True)
@@ -168,7 +168,7 @@ def _library(place: Path, name: str) -> Path | None:
     return next(filter(Path.exists, (place / (name + suffix) for suffix in EXTENSION_SUFFIXES)), None)
 
 
-def _is_whole(place: Path, name: str) -> bool:
+def _is_complete(place: Path, name: str) -> bool:
     """Return whether a library is in the cache, marked as ready, with its source, and not truncated.
 
     The loader does not notice a truncated library: the run ends with a bus error at the first missing page.
@@ -196,9 +196,9 @@ def _publish(workshop: Path, folder: Path) -> None:
             return
     for file in (_library(workshop, name), source, workshop / ready.name):
         os.replace(file, folder / file.name)
-    for left in folder.glob(f"{WORKSHOP}*"):  # left by killed runs
-        if time.time() - left.stat().st_mtime > DAY:
-            shutil.rmtree(left, ignore_errors=True)
+    for remains in folder.glob(f"{WORKSHOP}*"):  # left by killed runs
+        if time.time() - remains.stat().st_mtime > DAY:
+            shutil.rmtree(remains, ignore_errors=True)
 
 
 @contextmanager

@@ -48,11 +48,11 @@ class _Columns:
     def used(self) -> int:
         return len(self.outcomes)
 
-    def reshaped(self, count: int, room: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
+    def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
         """Return the first `count` rows in arrays of a larger capacity and these row shapes, padded with nan."""
         out = {}
         for name, shape in shapes.items():
-            out[name] = np.full((room, *shape), np.nan)
+            out[name] = np.full((capacity, *shape), np.nan)
             if count:
                 rows = self.arrays[name][:count]
                 out[name][tuple(map(slice, rows.shape))] = rows

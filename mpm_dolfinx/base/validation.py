@@ -111,8 +111,8 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
         raise ValueError(f"{name} = {line(values)}, must be a list of {what}")
     for i, value in enumerate(values):
         if not isinstance(value, (int, np.integer)) or value not in among or value in values[:i]:
-            there = ", ".join(map(str, among)) or "none is"
-            raise ValueError(f"{name}: body {line(value)}, must be one of the {what}, each once: {there}")
+            options = ", ".join(map(str, among)) or "none is"
+            raise ValueError(f"{name}: body {line(value)}, must be one of the {what}, each once: {options}")
 
 
 def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> None:

@@ -79,16 +79,16 @@ class _Placed:
     scope: _Scope
     name: str = ""
     shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    turn: tuple[float, ...] = ()
+    rotation: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the placed positions (n, 3): translated, then rotated about an axis."""
         x = x + self.shift
-        if not self.turn:
+        if not self.rotation:
             return x
-        a = np.array(self.turn[:3])
-        b = np.array(self.turn[3:6])
-        angle = np.deg2rad(self.turn[6])
+        a = np.array(self.rotation[:3])
+        b = np.array(self.rotation[3:6])
+        angle = np.deg2rad(self.rotation[6])
         k, r = (b - a) / np.linalg.norm(b - a), x - a
         return a + r * np.cos(angle) + np.cross(k, r) * np.sin(angle) + np.outer(r @ k, k) * (1 - np.cos(angle))
 
@@ -242,7 +242,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
     start = 0
     for k, one in enumerate(placed):
         places = one.places(np.concatenate([np.empty((0, 3)), *(p for _, p in one.scope.nodes)]))
-        known, where = _once([of for of, _ in one.scope.nodes], "node", places)
+        known, where = _unique([of for of, _ in one.scope.nodes], "node", places)
         for kind, number, rows in one.scope.cells:
             at = np.minimum(np.searchsorted(known, rows), max(0, len(known) - 1))
             missing = rows[known[at] != rows] if len(known) else rows
@@ -250,7 +250,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
                 raise ValueError(f"*ELEMENT: node {missing.flat[0]} is undefined, must be one of *NODE")
             cells.append((kind, start + where[at]))
             numbers.append((k, number))
-        _once([number for of, number in numbers if of == k], "element")
+        _unique([number for of, number in numbers if of == k], "element")
         x.append(places)
         start += len(places)
     groups = _groups(placed, cells, numbers)
@@ -259,7 +259,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
     return mesh
 
 
-def _once(
+def _unique(
     numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return node or element numbers in ascending order, and the permutation.

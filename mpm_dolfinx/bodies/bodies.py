@@ -234,11 +234,11 @@ def material_points(
     """Return the material points of the bodies on this process, at rest with a pore pressure, see `pressure_at`."""
     starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
     rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
-    mine = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
+    ids = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
     size = np.concatenate([body.size(row) for body, row in zip(bodies, rows, strict=True)])
     material = np.repeat(np.array([body.material for body in bodies], dtype=np.int32), list(map(len, rows)))
     x = centroids(corners)
-    n = len(mine)
+    n = len(ids)
     pressures = np.empty(0)
     refused = ""
     try:
@@ -248,7 +248,7 @@ def material_points(
     if refused := first(grid.comm, refused):
         raise ValueError(refused)
     return MaterialPoints(
-        id=mine,
+        id=ids,
         corners=corners,
         F=np.tile(np.eye(grid.stretches), (n, 1, 1)),
         volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
@@ -266,9 +266,9 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
         # the copies of the grid have equal owners
-        here = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
-        rows.append(part.start + here)
-        corners.append(of_part[here])
+        own = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
+        rows.append(part.start + own)
+        corners.append(of_part[own])
     return np.concatenate(rows), np.concatenate(corners)
 
 

@@ -61,9 +61,9 @@ class LatticeBody(Body):
             return out
         for axis, end in np.ndindex(self.dim, 2):
             inner = np.flatnonzero(~out[:, axis, end])
-            beside = index[inner]
-            beside[:, axis] += 2 * end - 1
-            out[inner, axis, end] = ~among(np.ravel_multi_index(tuple(beside.T), self.count), self.filled)
+            neighbour = index[inner]
+            neighbour[:, axis] += 2 * end - 1
+            out[inner, axis, end] = ~among(np.ravel_multi_index(tuple(neighbour.T), self.count), self.filled)
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
@@ -155,8 +155,8 @@ class RowsBody(LatticeBody):
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
     """Return the boundaries of rows from low to high, m: `per_cell` rows a cell, and a share of it in cut cells."""
     lines = grid.lines[axis] + grid.base[axis]
-    apart = SAME * grid.finest[axis]
-    ends = np.concatenate([[low], lines[(lines > low + apart) & (lines < high - apart)], [high]])
+    tolerance = SAME * grid.finest[axis]
+    ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
     width = grid.widths[axis][grid.cells_along(axis, (ends[1:] + ends[:-1]) / 2 - grid.base[axis])]
     count = np.maximum(1, np.rint(np.diff(ends) / width * per_cell)).astype(int)
     parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(ends[:-1], ends[1:], count, strict=True)]

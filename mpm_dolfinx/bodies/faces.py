@@ -140,17 +140,17 @@ def surface(
     present
         Which bodies are present, by default all.
     """
-    there = [present is None or bool(present[i]) for i in range(len(bodies))]
+    shown = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
     if name is not None and (not isinstance(name, str) or name not in known):
         raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
     box = limits(region, dim)
-    around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
+    around = [Faces.around(body) if here and sum(shown) > 1 else None for body, here in zip(bodies, shown, strict=True)]
     none = np.empty(0, np.int64)
     start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):
         on = body.outer() if name is None else body.named(name)
-        row, face = _in_region(body, *on, box) if there[i] else (none, none)
+        row, face = _in_region(body, *on, box) if shown[i] else (none, none)
         others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
         part, t = _free(Faces.of(body, row, face), others)
         part, xi = _limited(body, row, face, part, t, box)
@@ -237,9 +237,9 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
     """
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
-        way = X[:, 1 << k] - X[:, 0]
+        edge = X[:, 1 << k] - X[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):  # edges across an axis have no limit along it
-            ends = np.where(np.abs(way) > rounding(X), (region[:, None] - X[:, 0]) / way, [[[-np.inf]], [[np.inf]]])
+            ends = np.where(np.abs(edge) > rounding(X), (region[:, None] - X[:, 0]) / edge, [[[-np.inf]], [[np.inf]]])
         low[:, k] = np.maximum(0.0, ends.min(axis=0).max(axis=1))
         high[:, k] = np.minimum(1.0, ends.max(axis=0).min(axis=1))
     return low, np.maximum(low, high)
@@ -272,13 +272,13 @@ def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArr
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
     cover = Cover(*(np.concatenate([getattr(c, f.name) for c in on]) for f in fields(Cover)))
-    turned = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
-    row, low, high = uncovered(len(own.row), *(x[~turned] for x in (cover.face, cover.low, cover.high, cover.slack)))
-    whole = ~np.isin(row, cover.face[turned])
+    flipped = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
+    row, low, high = uncovered(len(own.row), *(x[~flipped] for x in (cover.face, cover.low, cover.high, cover.slack)))
+    whole = ~np.isin(row, cover.face[flipped])
     quads = np.where(BITS, high[whole, None], low[whole, None])
-    if not turned.any():
+    if not flipped.any():
         return row, quads
-    split, triangles = uncovered_triangles(own, cover, np.unique(cover.face[turned]))
+    split, triangles = uncovered_triangles(own, cover, np.unique(cover.face[flipped]))
     return np.concatenate([row[whole], split]), np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
 
 

@@ -65,14 +65,14 @@ class Contact:
         return float(np.linalg.norm(off, axis=2)[on].max(initial=0.0))
 
 
-def touches(bodies: Sequence[Body], there: Sequence[int], fill: int) -> bool:
+def touches(bodies: Sequence[Body], others: Sequence[int], fill: int) -> bool:
     """Return whether a seeded fill touches one of the present bodies."""
     own = Faces.around(bodies[fill])
-    return any(len(covers(own, Faces.around(bodies[other])).face) for other in there)
+    return any(len(covers(own, Faces.around(bodies[other])).face) for other in others)
 
 
 def put(
-    grid: Grid, bodies: Sequence[Body], there: Sequence[int], fill: int, points: MaterialPoints, new: MaterialPoints
+    grid: Grid, bodies: Sequence[Body], others: Sequence[int], fill: int, points: MaterialPoints, new: MaterialPoints
 ) -> MaterialPoints:
     """Return the points of a fill, placed onto the present bodies.
 
@@ -81,7 +81,7 @@ def put(
 
     Parameters
     ----------
-    bodies, there, fill
+    bodies, others, fill
         All bodies, indices of the present ones, and index of the fill.
     points, new
         Points of the present bodies, and of the seeded fill, on this process.
@@ -94,7 +94,7 @@ def put(
     body = bodies[fill]
     corners = bodies[fill].corners() - grid.base
     misfit = 0.0
-    found = {other: _contacts(grid, bodies, other, body, points) for other in there}
+    found = {other: _contacts(grid, bodies, other, body, points) for other in others}
     contacts = [contact for one in found.values() for contact in one]
     if any(contact.moved.any() for contact in contacts):
         u = _follow(grid, body, corners, contacts)
@@ -105,18 +105,18 @@ def put(
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
         warn(grid.comm, ResolutionWarning, what + "; seed it with the spacing of the body below", fill, misfit)
     for other, touching in found.items():
-        depth, gap, x = _room(grid, bodies, other, corners, points, misfit)
+        depth, gap, x = _penetration(grid, bodies, other, corners, points, misfit)
         if depth:
             what = f"stage: add: body {fill}: body {other} has moved into it by {depth:.3g} m at {x + grid.base}"
             raise ValueError(f"{what}; must be seeded in space that is free now")
         together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
         if together and not touching:
             warn_near(grid, f"bodies {other} and {fill}", gap, x + grid.base)
-    mine = corners[new.id - _start(bodies, fill)]
-    if (mine == new.corners).all():
+    own = corners[new.id - _start(bodies, fill)]
+    if (own == new.corners).all():
         return new
-    volume = domain_volumes(mine, grid.axisymmetric)
-    return replace(new, corners=mine, x=centroids(mine), volume0=volume, origin=mine, reference=mine)
+    volume = domain_volumes(own, grid.axisymmetric)
+    return replace(new, corners=own, x=centroids(own), volume0=volume, origin=own, reference=own)
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:
@@ -221,7 +221,7 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
         raise ValueError(f"{name}; following it, it has a corner at {x}, must be inside {grid.lower} to {grid.upper}")
 
 
-def _room(
+def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
     """Return the penetration of a body into a fill's domains, m, their gap in cells, and the place."""

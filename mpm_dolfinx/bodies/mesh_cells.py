@@ -140,7 +140,7 @@ class Polytopes:
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
         return cls(*map(np.concatenate, zip(*rows, strict=True)))
 
-    def apart(
+    def overlaps(
         self, i: NDArray[np.int64], j: NDArray[np.int64], slack: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return which pairs (m,) of cells i, j overlap, and by how much, m.

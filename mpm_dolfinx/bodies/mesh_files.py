@@ -22,7 +22,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import instance, line, line_of, path
 from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
-from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
+from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded, warn_small
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
@@ -93,17 +93,17 @@ def from_mesh(
     else:
         instance("mesh", mesh, dolfinx_mesh.Mesh)
         found = _of_dolfinx(grid, mesh, cell_tags, facet_tags, names)
-    return seeded(grid, found, part, per_cell, material, name)
+    return warn_small(grid, seeded(grid, found, part, per_cell, material, name), per_cell, name)
 
 
 def _file(file: Path) -> meshio.Mesh:
     """Return the mesh of a file; its error message contains meshio's output."""
-    said = StringIO()
+    output = StringIO()
     try:
-        with redirect_stdout(said), redirect_stderr(said):
+        with redirect_stdout(output), redirect_stderr(output):
             return mesh_readers.read(file)
     except (Exception, SystemExit) as error:  # meshio exits for a file that it cannot read
-        why = line_of(error) if isinstance(error, Exception) else " ".join(said.getvalue().split())
+        why = line_of(error) if isinstance(error, Exception) else " ".join(output.getvalue().split())
         why = why or type(error).__name__
         allowed = "" if " must " in why else "; must be a file that meshio reads"
         raise ValueError(f"mesh {file}: {why}{allowed}") from None
@@ -122,7 +122,7 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: st
         kind, rows = _first_order(dim, block)
         _check_nodes(rows, len(x))
         if kind != block.type and kind in KINDS[dim]:
-            curved, off = curved + len(rows), max(off, _beside(x, rows, kind))
+            curved, off = curved + len(rows), max(off, _edge_node_distance(x, rows, kind))
         blocks.append((kind, rows[:, : _vertices(dim, kind)]))
     if curved:
         _warn_curved(grid, name, curved, off)
@@ -181,7 +181,7 @@ def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
         raise ValueError(f"mesh: a cell has the node {worst}, must be one of {count}, from 0 on")
 
 
-def _beside(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
+def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
     """Return the largest distance, m, of edge nodes of second-order cells from the midpoints of the edges.
 
     Edge nodes follow the vertices, in an order that depends on the format.
@@ -287,8 +287,8 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
     """Return the first coordinates (nodes, dim) of vertices (nodes, 2 or 3); ValueError for cells outside one plane."""
     used = np.unique(np.concatenate([np.empty(0, np.int64), *(rows.ravel() for rows in cells.values())]))
     if not np.isfinite(x[used]).all():
-        bad = used[~np.isfinite(x[used]).all(axis=1)][0]
-        raise ValueError(f"mesh: vertex {bad} is at {x[bad]}, must be at finite coordinates")
+        invalid = used[~np.isfinite(x[used]).all(axis=1)][0]
+        raise ValueError(f"mesh: vertex {invalid} is at {x[invalid]}, must be at finite coordinates")
     if len(used) and x.shape[1] > dim and np.ptp(x[used, 2]) > NEAR * np.ptp(x[used, :2], axis=0).max():
         low, high = x[used, 2].min(), x[used, 2].max()
         raise ValueError(f"mesh: a surface in space, z from {low:.3g} to {high:.3g}, must be flat in 2D, in x and y")
@@ -313,7 +313,7 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
         what = f"must have {vertices} or {orders}: of first or second order"
         raise ValueError(f"mesh: its cells have {dofs.shape[1]} nodes, {what}")
     if dofs.shape[1] != vertices:
-        off = _beside(mesh.geometry.x, _as_meshio(dofs, kind), kind)
+        off = _edge_node_distance(mesh.geometry.x, _as_meshio(dofs, kind), kind)
         count, off = mesh.comm.allreduce(owned), mesh.comm.allreduce(off, op=MPI.MAX)
         _warn_curved(grid, "mesh", count, off)
         dofs = dofs[:, :vertices]

@@ -43,9 +43,9 @@ def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
     if file.suffix.lower() != ".vtu":
         return
     counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
-    there, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
-    if len(counts) > 1 and there != whole:
-        raise ValueError(f"{len(counts)} pieces of {whole} cells, but meshio reads {there}; must be one piece")
+    read, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
+    if len(counts) > 1 and read != whole:
+        raise ValueError(f"{len(counts)} pieces of {whole} cells, but meshio reads {read}; must be one piece")
 
 
 def check_systems(mesh: meshio.Mesh) -> None:

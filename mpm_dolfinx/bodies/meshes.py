@@ -145,13 +145,13 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`."""
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
     cells = mesh.part(part)
-    _check_once(mesh, cells, name)
+    _check_repeated(mesh, cells, name)
     domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, cells), strict=True))
     out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim) - grid.base))
     if len(out):
         x = domains.reshape(-1, grid.dim)[out[0]]
         raise ValueError(f"{name}: has a vertex at {x}, must be inside the grid {grid.lower} to {grid.upper}")
-    domains, keys = _turned(domains, keys)
+    domains, keys = _oriented(domains, keys)
     _check_convex(domains, name)
     facets, facet = _facets(keys)
     sides = np.stack([facet.ravel(), np.repeat(cell, 2 * grid.dim)], axis=1)
@@ -164,14 +164,13 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     outer = (facet > 0) & (count[facet] == 1)  # facet 0: face inside a cell
     twice = (of > 0) & (count[of] == 2)
     _check_sides(mesh, domains, facets, facet, count == 2, name)
-    _check_apart(mesh.x, cells, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
-    tagged = {side: outer & _among(facets, rows)[facet] for side, rows in mesh.sides.items()}
+    _check_overlaps(mesh.x, cells, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
+    tagged = {side: outer & _in_side(facets, rows)[facet] for side, rows in mesh.sides.items()}
     vertices, row, kept = _split(grid, domains, per_cell)
     surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
     named = {side: rows for side, rows in zip(tagged, tagged_rows, strict=True) if rows.any()}
     body = MeshBody(vertices=vertices, surface=surface, tagged=named, material=material)
     _check_conforming(body, name)
-    _warn_small(grid, body, per_cell, name)
     return check_inside(grid, body, name)
 
 
@@ -196,7 +195,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
     return out
 
 
-def _check_once(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
+def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
     """Raise an error for repeated cells, which would count twice in weight and stiffness."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
@@ -228,7 +227,7 @@ def _check_sides(
         raise ValueError(f"{name}: {same.sum()} facets {what} {x}: cells must not overlap")
 
 
-def _check_apart(
+def _check_overlaps(
     x: NDArray[np.float64],
     cells: dict[str, NDArray[np.int64]],
     outer: NDArray[np.int64],
@@ -255,7 +254,7 @@ def _check_apart(
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
     size = boxes[:, 1] - boxes[:, 0]
     slack = NEAR / 2 * size.min(axis=1) + rounding(x)
-    pairs = np.stack(_boxes_that_meet(boxes, size, outer, slack), axis=1)
+    pairs = np.stack(_box_overlaps(boxes, size, outer, slack), axis=1)
     both = np.unique(np.sort(pairs, axis=1) @ [len(boxes), 1])
     both = np.setdiff1d(both, np.sort(neighbours, axis=1) @ [len(boxes), 1], assume_unique=True)
     pairs = np.stack(np.divmod(both, len(boxes)), axis=1)
@@ -265,7 +264,7 @@ def _check_apart(
     solid = Polytopes.of(x, {kind: nodes[row[kinds == k]] for k, (kind, nodes) in enumerate(cells.items())})
     i, j = place.reshape(pairs.shape).T
     slack = slack[near_ones] + 2 * solid.warp
-    deep, depth = solid.apart(i, j, slack[i] + slack[j])
+    deep, depth = solid.overlaps(i, j, slack[i] + slack[j])
     if len(deep):
         one, other = boxes[pairs[deep[depth.argmax()]]]
         meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
@@ -273,7 +272,7 @@ def _check_apart(
         raise ValueError(f"{name}: {what}, by {depth.max():.3g} m; must not")
 
 
-def _boxes_that_meet(
+def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the pairs (n,), (n,) of an outer cell and another cell with overlapping boxes (m, 2, d).
@@ -289,15 +288,15 @@ def _boxes_that_meet(
             trees = [cKDTree(middle[rows] * (2 / (most + other))) for rows in (a, b)]
             pairs = trees[0].sparse_distance_matrix(trees[1], 1.0, p=np.inf, output_type="ndarray")
             i, j = a[pairs["i"]], b[pairs["j"]]
-            meet = (i != j) & (np.abs(middle[i] - middle[j]) < (size[i] + size[j]) / 2).all(axis=1)
-            i, j = i[meet], j[meet]
+            overlap = (i != j) & (np.abs(middle[i] - middle[j]) < (size[i] + size[j]) / 2).all(axis=1)
+            i, j = i[overlap], j[overlap]
             lap = np.minimum(boxes[i, 1], boxes[j, 1]) - np.maximum(boxes[i, 0], boxes[j, 0])
-            meet = (lap > (slack[i] + slack[j])[:, None]).all(axis=1)
-            out.append(np.stack([i[meet], j[meet]]))
+            overlap = (lap > (slack[i] + slack[j])[:, None]).all(axis=1)
+            out.append(np.stack([i[overlap], j[overlap]]))
     return tuple(np.concatenate(out, axis=1))
 
 
-def _turned(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return domains and keys of their faces, with the first two axes of left-handed domains swapped."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
@@ -317,10 +316,10 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
     least = np.linalg.det(edges).min(axis=1)
     of_simplices = simplex_volumes(vertices(np.ascontiguousarray(domains.transpose(1, 2, 0))))
     least = np.minimum(least, of_simplices.min(axis=0, initial=np.inf))
-    bad = np.flatnonzero(~(least > NEAR * size))
-    if len(bad):
-        x = domains[bad[0]].mean(axis=0)
-        what = f"{len(bad)} cells are flat, turned inside out or not convex, the first at {x}"
+    invalid = np.flatnonzero(~(least > NEAR * size))
+    if len(invalid):
+        x = domains[invalid[0]].mean(axis=0)
+        what = f"{len(invalid)} cells are flat, turned inside out or not convex, the first at {x}"
         raise ValueError(f"{name}: {what}; must be convex, of corners that are not flat")
 
 
@@ -331,7 +330,7 @@ def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
     return rows[first], facet[1:].reshape(keys.shape[:2])
 
 
-def _among(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> NDArray[np.bool_]:
+def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> NDArray[np.bool_]:
     """Return which facets (m,) of a mesh belong to a side."""
     width = facets.shape[1]
     rows = [np.pad(np.sort(n, axis=1), ((0, 0), (width - n.shape[1], 0)), constant_values=-1) for n in named]
@@ -377,8 +376,8 @@ def _check_conforming(body: MeshBody, name: str) -> None:
         raise ValueError(f"{name}: {what}: hanging or duplicate nodes, must be merged, or belong to two parts")
 
 
-def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
-    """Warn about domains that are much smaller than the grid needs."""
+def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody:
+    """Return the body; warn about domains that are much smaller than the grid needs."""
     cell = grid.sizes_at(body.centre - grid.base).prod(axis=-1)
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
@@ -386,3 +385,4 @@ def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
         what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s: "
         what += "they cost as much as large ones; a coarser mesh is sufficient"
         warn(grid.comm, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])
+    return body

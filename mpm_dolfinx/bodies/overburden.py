@@ -36,11 +36,11 @@ def overburden(
     inside = ((across[ray] >= low[domain, :-1]) & (across[ray] <= high[domain, :-1])).all(axis=1)
     ray, domain = ray[inside], domain[inside]
     bottom, top = _chord(corners[domain], across[ray], low[domain, -1], high[domain, -1])
-    met = top > bottom
-    ray = ray[met]
-    weight = unit_weight[domain[met]]
-    bottom = bottom[met]
-    top = top[met]
+    crossed = top > bottom
+    ray = ray[crossed]
+    weight = unit_weight[domain[crossed]]
+    bottom = bottom[crossed]
+    top = top[crossed]
     surface = np.full(len(across), -np.inf)
     np.maximum.at(surface, ray, top)
     # positions on one vertical line share cumulative sums, sorted by line and height
@@ -63,11 +63,11 @@ def _chord(corners: NDArray, across: NDArray, low: NDArray, high: NDArray) -> tu
     d = corners.shape[2]
     for face in range(2 * d):
         n, on = face_vectors(corners, face), corners[:, FACES[d][face]].mean(axis=1)
-        ahead = ((across - on[:, :-1]) * n[:, :-1]).sum(axis=1)  # n . (x - on) <= 0 inside
+        depth = ((across - on[:, :-1]) * n[:, :-1]).sum(axis=1)  # n . (x - on) <= 0 inside
         slope = n[:, -1]
         steep = np.abs(slope) > SAME * np.linalg.norm(n, axis=1)
-        at = on[:, -1] - np.divide(ahead, slope, out=np.zeros(len(n)), where=steep)
+        at = on[:, -1] - np.divide(depth, slope, out=np.zeros(len(n)), where=steep)
         high = np.where(steep & (slope > 0), np.minimum(high, at), high)
         low = np.where(steep & (slope < 0), np.maximum(low, at), low)
-        high = np.where(~steep & (ahead > 0), -np.inf, high)
+        high = np.where(~steep & (depth > 0), -np.inf, high)
     return low, high

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import instance, line, numbers, whole
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE
-from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
+from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded, warn_small
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import at_root
 
@@ -76,7 +76,8 @@ def polygon(
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])
     mesh = at_root(grid.comm, lambda: _filled(loops, edge))
-    return seeded(grid, mesh, None, per_cell, material, "polygon")
+    body = seeded(grid, mesh, None, per_cell, material, "polygon")
+    return body if size is None else warn_small(grid, body, per_cell, "polygon")
 
 
 def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
@@ -94,18 +95,18 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
     after = np.concatenate([np.roll(rows, -1) for rows in np.split(np.arange(len(a)), stop[:-1])])
     b = a[after]
     i, j = np.triu_indices(len(a), 1)
-    beside = (after[i] == j) | (after[j] == i)
+    adjacent = (after[i] == j) | (after[j] == i)
     # two edges intersect if the ends of each are not on one side of the other
     slack = ROUND_OFF * np.ptp(outlines[0], axis=0).max() ** 2
-    sides = [_turn(a[i], b[i], a[j]), _turn(a[i], b[i], b[j]), _turn(a[j], b[j], a[i]), _turn(a[j], b[j], b[i])]
-    apart = np.any([(np.minimum(*two) > slack) | (np.maximum(*two) < -slack) for two in (sides[:2], sides[2:])], axis=0)
+    sides = [_areas(a[i], b[i], a[j]), _areas(a[i], b[i], b[j]), _areas(a[j], b[j], a[i]), _areas(a[j], b[j], b[i])]
+    separate = np.any([(np.minimum(*s) > slack) | (np.maximum(*s) < -slack) for s in (sides[:2], sides[2:])], axis=0)
     low, high = np.minimum(a, b), np.maximum(a, b)
-    apart |= ((low[i] > high[j]) | (low[j] > high[i])).any(axis=1)  # collinear edges
-    back = beside & (np.abs(np.where(after[i] == j, sides[1], sides[0])) <= slack)
-    back &= np.einsum("nd,nd->n", b[i] - a[i], b[j] - a[j]) < 0
-    wrong = np.flatnonzero((~apart & ~beside) | back)
-    if len(wrong):
-        one, other = ([a[k[wrong[0]]].tolist(), b[k[wrong[0]]].tolist()] for k in (i, j))
+    separate |= ((low[i] > high[j]) | (low[j] > high[i])).any(axis=1)  # collinear edges
+    folded = adjacent & (np.abs(np.where(after[i] == j, sides[1], sides[0])) <= slack)
+    folded &= np.einsum("nd,nd->n", b[i] - a[i], b[j] - a[j]) < 0
+    crossing = np.flatnonzero((~separate & ~adjacent) | folded)
+    if len(crossing):
+        one, other = ([a[k[crossing[0]]].tolist(), b[k[crossing[0]]].tolist()] for k in (i, j))
         raise ValueError(f"polygon: the edges {one} and {other} touch or cross, must not")
     for k, hole in enumerate(outlines[1:], start=1):
         within = [_inside(hole[0], outline) for m, outline in enumerate(outlines) if m != k]
@@ -113,7 +114,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
             raise ValueError(f"polygon: the hole at {hole[0]} must be inside the polygon, and outside other holes")
 
 
-def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the signed areas (n,) of the parallelograms from a to b and to c (n, 2): > 0 on the left of a to b."""
     return _cross(b - a, c - a)
 
@@ -133,19 +134,19 @@ def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
 @contextmanager
 def _gmsh() -> Iterator:
     """Provide gmsh with a separate model, and restore the user's gmsh state and handler of Ctrl-C."""
-    hears = signal.getsignal(signal.SIGINT)
+    handler = signal.getsignal(signal.SIGINT)
     try:
         import gmsh
     except ImportError as error:
         what = "polygon: needs gmsh: on Debian `apt install python3-gmsh`, elsewhere `conda install python-gmsh`"
         raise ImportError(what, name="gmsh") from error
-    tells = hasattr(gmsh, "isInitialized")  # before 4.9 its state is unknown: initialised again, never finalised
-    begun, talks = tells and gmsh.isInitialized(), 0.0
-    if begun or not tells:
+    reports = hasattr(gmsh, "isInitialized")  # before 4.9 its state is unknown: initialised again, never finalised
+    running, verbosity = reports and gmsh.isInitialized(), 0.0
+    if running or not reports:
         with suppress(Exception):  # before 4.9 it raises after an earlier finalisation
-            talks = gmsh.option.getNumber("General.Terminal")
+            verbosity = gmsh.option.getNumber("General.Terminal")
             gmsh.option.setNumber("General.Terminal", 0)  # hides the message about initialising again
-    if not begun:
+    if not running:
         gmsh.initialize()
     before = gmsh.model.getCurrent()
     try:
@@ -155,11 +156,11 @@ def _gmsh() -> Iterator:
     finally:
         gmsh.model.remove()
         gmsh.model.setCurrent(before)
-        gmsh.option.setNumber("General.Terminal", talks)
-        if tells and not begun:
+        gmsh.option.setNumber("General.Terminal", verbosity)
+        if reports and not running:
             gmsh.finalize()
-        if hears is not None:
-            signal.signal(signal.SIGINT, hears)
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
 
 
 def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:

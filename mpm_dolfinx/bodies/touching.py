@@ -111,14 +111,14 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(BITS, t[:, None], 1 - t[:, None]).prod(axis=2)
 
 
-def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) with boxes within a distance `reach`."""
+def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
+    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) with boxes within a distance `distance`."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
     size = [np.ptp(c, axis=1) for c in (a, b)]
     edge = np.maximum(size[0].max(axis=0), size[1].max(axis=0))
-    slack = reach + edge.max() / 100
+    slack = distance + edge.max() / 100
     i, j = (
         np.flatnonzero(((c.max(axis=1) >= low - slack) & (c.min(axis=1) <= high + slack)).all(axis=1)) for c in (a, b)
     )
@@ -134,13 +134,13 @@ def covers(own: Faces, other: Faces) -> Cover:
     """Return the contacts between faces of a body and opposite faces of another."""
     i, j = near(own.corners, other.corners)
     n, m = (f.outward / np.maximum(np.linalg.norm(f.outward, axis=1, keepdims=True), TINY) for f in (own, other))
-    back = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
-    i, j = i[back], j[back]
+    opposite = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
+    i, j = i[opposite], j[opposite]
     t, off = local(own.corners[i], other.corners[j], n[i])
     low, high = t.min(axis=1), t.max(axis=1)
     edge, bend = own.edge()[i], own.bend[i] + other.bend[j]
-    lost = 4 * rounding(own.corners)
-    slack = np.minimum(SAME + (lost + bend) / np.maximum(edge.min(axis=1), TINY), (high - low).min(axis=1) / 4)
+    tolerance = 4 * rounding(own.corners)
+    slack = np.minimum(SAME + (tolerance + bend) / np.maximum(edge.min(axis=1), TINY), (high - low).min(axis=1) / 4)
     upper = t > ((low + high) / 2)[:, None]
     corner = upper @ [1, 2]
     straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, SAME)
@@ -156,13 +156,13 @@ def covers(own: Faces, other: Faces) -> Cover:
     off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # differs only for faces that are not parallelograms
     at = np.where(straight[:, None], at, local(own.corners[i], off_edges[:, None], n[i])[0][:, 0])
     middle = np.einsum("nk,nkd->nd", weights(at), own.corners[i])
-    _, beside = local(other.corners[j], middle[:, None], m[j])
-    gap = np.where(straight, 0.0, np.abs(beside[:, 0]))  # rotated faces: at the middle of the overlap
+    _, in_plane = local(other.corners[j], middle[:, None], m[j])
+    gap = np.where(straight, 0.0, np.abs(in_plane[:, 0]))  # rotated faces: at the middle of the overlap
     with np.errstate(divide="ignore", invalid="ignore"):  # boxes of zero width, excluded by `on`
         for bits in BITS:
             at = out.at(np.where(bits, ends[1], ends[0]))
             gap = np.where(straight, np.maximum(gap, np.abs((at * off).sum(axis=1))), gap)
-    on &= gap <= NEAR * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + lost + 2 * bend
+    on &= gap <= NEAR * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + tolerance + 2 * bend
     return Cover(*(getattr(out, name)[on] for name in Cover.__dataclass_fields__))
 
 
@@ -211,10 +211,10 @@ def uncovered_triangles(
         free, whose = [s[:, :, ~has]], [owner[~has]]
         s, owner = s[:, :, has], owner[has]
         quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # in order around
-        turn = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
+        orientation = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
         for a in range(4):
             p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
-            inside = turn[owner] * _cross((q - p).T, (s - p).transpose(0, 2, 1))
+            inside = orientation[owner] * _cross((q - p).T, (s - p).transpose(0, 2, 1))
             s3 = np.concatenate([s, inside[:, None]], axis=1)
             out, out_owner, s3, owner = split(s3, owner, 2, 0.0)
             free.append(out[:, :2])
@@ -403,18 +403,18 @@ def meeting(
     and gap 0; distant ones a gap of inf.
     """
     i, j = near(a[0], b[0])
-    apart, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
-    if (apart <= slack).any():
-        k = int(np.argmin(apart + slack))
-        depth, gap = max(0.0, -apart[k]) if apart[k] < -slack[k] else 0.0, 0.0
+    separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
+    if (separations <= slack).any():
+        k = int(np.argmin(separations + slack))
+        depth, gap = max(0.0, -separations[k]) if separations[k] < -slack[k] else 0.0, 0.0
     else:
         one, other = in_cells(a[0]), in_cells(b[0])
         i, j = near(one, other, 1.0)
-        apart = separation(one[i], other[j])
+        separations = separation(one[i], other[j])
         if not len(i):
             return 0.0, np.inf, np.zeros(one.shape[-1])
-        k = int(np.argmin(apart))
-        depth, gap = 0.0, float(apart[k])
+        k = int(np.argmin(separations))
+        depth, gap = 0.0, float(separations[k])
     one, other = a[0][i[k]], b[0][j[k]]
     x = (np.maximum(one.min(axis=0), other.min(axis=0)) + np.minimum(one.max(axis=0), other.max(axis=0))) / 2
     return depth, gap, x
@@ -422,19 +422,19 @@ def meeting(
 
 def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> None:
     """Raise an error for seeded bodies that overlap; warn about separate bodies that will stick."""
-    there = [i for i in range(len(bodies)) if present[i]]
-    found = {i: solids(bodies[i]) for i in there} if len(there) > 1 else {}
+    indices = [i for i in range(len(bodies)) if present[i]]
+    found = {i: solids(bodies[i]) for i in indices} if len(indices) > 1 else {}
     first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
-    for i, j in combinations(there, 2):
+    for i, j in combinations(indices, 2):
         depth, gap, x = meeting(found[i], found[j], lambda x: grid.in_cells(x - grid.base))
         if depth:
             raise ValueError(f"bodies {i} and {j}: overlap at {x} by {depth:.3g} m, must not")
         together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # contact groups share no node
-        if together and 0 < gap < 1 and not any(_lies_in(x, found[k][0]) for k in there if k not in (i, j)):
+        if together and 0 < gap < 1 and not any(_inside(x, found[k][0]) for k in indices if k not in (i, j)):
             warn_near(grid, f"bodies {i} and {j}", gap, x)
 
 
-def _lies_in(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
+def _inside(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
     """Return whether a position (d,), m, lies in one of the domains (n, 2^d, d), m."""
     point = np.broadcast_to(x, (1, *domains.shape[1:]))
     which, _ = near(domains, point)

@@ -216,7 +216,7 @@ class Contacts:
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
         """Return points on faces of all processes, at the present positions of the points."""
         patches, d = cut.surface(faces), self.grid.dim
-        index = FACES[d][faces.face[patches.here]]
+        index = FACES[d][faces.face[patches.face]]
         now, then = (
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
         )
@@ -225,7 +225,7 @@ class Contacts:
         n = len(now)
         k = 2 ** (d - 1) * d
         outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
-        whole = np.column_stack([patches.here, patches.cell])
+        whole = np.column_stack([patches.face, patches.cell])
         rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
         x, resists, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)

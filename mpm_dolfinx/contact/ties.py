@@ -84,9 +84,9 @@ class Ties(Acting):
             moved[here] = points.corners[at] - points.origin[at]
             moved = grid.comm.allreduce(moved)
             across = p.xi * np.where(np.arange(d) == tie.axis, -1.0, 1.0)
-            gap = p.now(points) - p.origin(points) - interpolate(moved[tie.partner[p.here]], across)
-            y = p.x + tie.way[p.here]
-            inside = y - NEAR * np.sign(tie.way[p.here, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
+            gap = p.now(points) - p.origin(points) - interpolate(moved[tie.partner[p.face]], across)
+            y = p.x + tie.way[p.face]
+            inside = y - NEAR * np.sign(tie.way[p.face, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
             index = np.floor(grid.in_cells(inside)).astype(np.int64)
             other = np.ravel_multi_index(tuple(index.T), tuple(grid.shape)) + p.cell // grid.cells * grid.cells
             area = np.linalg.norm(p.area(points), axis=1)

@@ -203,7 +203,7 @@ class Tools:
         grid, d = self.grid, self.grid.dim
         patches = cut.surface(self.faces)
         x, area = patches.now(points), patches.area(points)
-        size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
+        size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
         resists = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
         # loads do not act on the initial stress

@@ -36,14 +36,14 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
         return warn_overfilled
     number = over_all(grid.comm, int(grid.cell_number[cut.cells[fill.argmax()]]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
-    who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
+    bodies_text = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
     warn(
         grid.comm,
         ResolutionWarning,
         "the cell at %s is filled to %.0f %%, more than it can hold: %s overlap",
         x,
         100 * most,
-        who,
+        bodies_text,
     )
     return None
 
@@ -56,7 +56,7 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
     return found, grid.base + grid.places(np.array(np.unravel_index(cell % grid.cells, grid.shape)), 0.5)
 
 
-LOST = 0.03
+LOSS = 0.03
 """Lost fraction of a soft material's deformation, in mixed cells, from which a warning is issued."""
 AGAIN = 2.0
 """Growth of that fraction from one warning to the next, as interfaces move to the middle of cells."""
@@ -65,7 +65,7 @@ FINE = 0.1
 
 
 def warn_smeared(
-    cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOST
+    cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOSS
 ) -> Callable[..., Any]:
     """Warn about the soft material that loses most deformation in cells shared with stiffer materials.
 
@@ -86,44 +86,44 @@ def warn_smeared(
     whole = over_all(grid.comm, sum_by(cut.to_cells(points.material), volume, count))
     found = []
     for modulus in (lambda m: m.oedometric, lambda m: m.shear):
-        lost, contrast, softest = _lost(cut, volume, cut.to_cells(materials.table(points, modulus)))
+        loss, contrast, softest = _losses(cut, volume, cut.to_cells(materials.table(points, modulus)))
         of = cut.to_cells(points.material)[softest]
-        each = over_all(grid.comm, sum_by(of, lost, count))
+        each = over_all(grid.comm, sum_by(of, loss, count))
         share = np.divide(each, whole, out=np.zeros(count), where=whole > 0)
         i = int(share.argmax())
-        found.append((share[i], i, np.where(of == i, lost, 0.0), contrast))
-    share, i, lost, contrast = max(found, key=lambda row: row[0])
+        found.append((share[i], i, np.where(of == i, loss, 0.0), contrast))
+    share, i, loss, contrast = max(found, key=lambda row: row[0])
     if share <= least:
         return partial(warn_smeared, materials=materials, least=least)
-    most = over_all(grid.comm, float(lost.max(initial=0.0)), MPI.MAX)
-    at = np.flatnonzero(lost == most)[:1]
+    most = over_all(grid.comm, float(loss.max(initial=0.0)), MPI.MAX)
+    at = np.flatnonzero(loss == most)[:1]
     cell = over_all(grid.comm, int(grid.cell_number[at].max(initial=-1)), MPI.MAX)
-    much = over_all(grid.comm, float(contrast[at].max(initial=0.0)), MPI.MAX)
+    contrast_most = over_all(grid.comm, float(contrast[at].max(initial=0.0)), MPI.MAX)
     those, x = bodies_in(cut, bodies, cell)
     what = "materials of bodies %s share cells, as at %s: material %d, up to %.3g times as soft as its neighbour, "
     what += "deforms about %.0f %% too little under a load across the layers; place interfaces on grid lines, or use "
     what += "smaller cells"
-    warn(grid.comm, ResolutionWarning, what, " and ".join(map(str, those)), x, i, much, 100 * share)
+    warn(grid.comm, ResolutionWarning, what, " and ".join(map(str, those)), x, i, contrast_most, 100 * share)
     return partial(warn_smeared, materials=materials, least=AGAIN * share)
 
 
-def _lost(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
+def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
     """Return the lost volumes (n,), m^d, of the softest material in owned cells, contrasts (n,), and its pieces (n,).
 
     With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M; equal strain in the
-    cell gives 1 / sum s M.  Their difference, over the largest 1/M, is lost: at most (1 - sqrt(r))^2 of the cell for
+    cell gives 1 / sum s M.  Their difference, over the largest 1/M, is loss: at most (1 - sqrt(r))^2 of the cell for
     two moduli of ratio r < 1.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
     softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last entry wins
-    held, stiffness, compliance = (sum_by(cut.cells, volume * y, n) for y in (1.0, modulus, 1 / modulus))
-    lost = np.zeros(n)
+    total, stiffness, compliance = (sum_by(cut.cells, volume * y, n) for y in (1.0, modulus, 1 / modulus))
+    loss = np.zeros(n)
     contrast = np.ones(n)
-    at = np.flatnonzero(held > 0)
-    lost[at] = modulus[softest[at]] * (compliance[at] - held[at] ** 2 / stiffness[at])
+    at = np.flatnonzero(total > 0)
+    loss[at] = modulus[softest[at]] * (compliance[at] - total[at] ** 2 / stiffness[at])
     contrast[at] = modulus[hardest[at]] / modulus[softest[at]]
-    return np.where(lost > FINE * held, lost, 0.0), contrast, softest
+    return np.where(loss > FINE * total, loss, 0.0), contrast, softest
 
 
 COARSE = 0.7  # of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
@@ -148,13 +148,13 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
             n, spacing = body.across(axis)
             h = _edge(grid, body, axis)
             if spacing > COARSE * h and n <= few and _bends(grid, bodies, i, axis, walls, slender):
-                much = "it carries no moment and creeps"
+                consequence = "it carries no moment and creeps"
                 if n > 1:
-                    much = f"it bends up to {1 / (n**2 - 1):.0%} too much"
+                    consequence = f"it bends up to {1 / (n**2 - 1):.0%} too much"
                 if n > 1 and wet:
-                    much = f"with pore fluid it bends about {LOST_WET / n**2:.0%} too much and creeps"
+                    consequence = f"with pore fluid it bends about {LOST_WET / n**2:.0%} too much and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
-                warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, h, much)
+                warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, h, consequence)
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:

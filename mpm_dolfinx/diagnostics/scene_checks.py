@@ -51,27 +51,27 @@ def check_held(
     number = part[cells[first[row] // 2**grid.dim]]  # any cell at the node: all belong to one part
     against = np.zeros(len(number), dtype=np.int64)
     for cell, other, place, along in holds:
-        both, twice = [part[cell]], 1
+        both, sides = [part[cell]], 1
         if other is not None:
-            travel, twice = Exchange(grid.comm, grid.owner(other)), 2
-            both.append(travel.back(part[grid.local(travel.send(other))]))
+            exchange, sides = Exchange(grid.comm, grid.owner(other)), 2
+            both.append(exchange.back(part[grid.local(exchange.send(other))]))
         number = np.concatenate([number, *both])
-        against = np.concatenate([against, *(both[::-1] if twice == 2 else [np.zeros(len(cell), dtype=np.int64)])])
-        x, direction = np.concatenate([x, *[place] * twice]), np.concatenate([direction, *[along] * twice])
+        against = np.concatenate([against, *(both[::-1] if sides == 2 else [np.zeros(len(cell), dtype=np.int64)])])
+        x, direction = np.concatenate([x, *[place] * sides]), np.concatenate([direction, *[along] * sides])
     x = (x - centre[number - 1]) / size[number - 1, None]  # scaled, so that rotations of small distant parts count
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
     if grid.axisymmetric:  # rings have one rigid-body mode, along the axis
         modes = [direction[:, 1]]
     R = np.stack(modes, axis=1)
-    held, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # entry 0: the ground
+    reached, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # entry 0: the ground
     while True:
-        on = held[against]
+        on = reached[against]
         grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
         grams, before = grid.comm.allreduce(np.stack(grams)), missing
         ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
-        held[1:] = missing == 0
+        reached[1:] = missing == 0
         if (missing == before).all():
             break
     for k in range(1, count + 1):

@@ -30,9 +30,9 @@ def check_options(
     quadrature: str,
 ) -> None:
     """Raise an error for invalid terms, sources or quadrature, and for pressures and sources without fluid."""
-    turned = [i for i, body in enumerate(bodies) if not body.aligned]
-    if quadrature == "point" and turned:
-        raise ValueError(f"quadrature 'point': body {turned[0]} is mapped or a mesh, must be a box along the grid")
+    rotated = [i for i, body in enumerate(bodies) if not body.aligned]
+    if quadrature == "point" and rotated:
+        raise ValueError(f"quadrature 'point': body {rotated[0]} is mapped or a mesh, must be a box along the grid")
     functions("terms", _functions_of(terms))
     functions("sources", sources)
     if fluid is not None:

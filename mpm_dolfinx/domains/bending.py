@@ -44,11 +44,11 @@ def followed(
     out = np.empty((2, *x.shape))
     # corners are the last axis: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
-        here, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
-        out[0, part] = _polynomial(field, y, here).T
+        slots, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
+        out[0, part] = _polynomial(field, y, slots).T
         h = grid.h[:, None] if grid.even else grid.sizes(cells[part]).T
         weights = 0.5 * ((y / h) ** 2 - 0.25)  # t (t - 1) / 2
-        out[1, part] = sum(weights[a] * _polynomial(bends[a], y, here, a) for a in range(grid.dim)).T
+        out[1, part] = sum(weights[a] * _polynomial(bends[a], y, slots, a) for a in range(grid.dim)).T
     return out
 
 
@@ -86,7 +86,7 @@ def _second_differences(
     bits = corner_bits(grid.dim)
     out = []
     order = np.lexsort(grid.signs.T)  # of the nodes, to match `bits`
-    nodes, beside = grid.cell_nodes[cells], grid.beside(cells)
+    nodes, neighbours = grid.cell_nodes[cells], grid.neighbours(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
         first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])
@@ -94,7 +94,7 @@ def _second_differences(
         ends = []
         known = []
         for k, (end, value) in enumerate(((low, first), (high, last))):
-            local = beside[:, a, k]
+            local = neighbours[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
             known.append((local >= 0) & filled[local])
             if grid.even:

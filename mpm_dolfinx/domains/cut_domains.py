@@ -21,7 +21,7 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-STAYS = 3e-4
+STILL = 3e-4
 """Largest motion of corners, in cells, since the domains were cut; beyond it they are cut again.
 
 The reference is a cut in every step.  In a consolidating column of ten cells the pressures change by 7e-5 of the load,
@@ -38,7 +38,7 @@ class Patches:
         Background grid.
     faces
         Faces of the surface.
-    here, at : (n,)
+    face, at : (n,)
         Index of the face among these, and of the material point.
     cell : (n,)
         Lexicographic cell.
@@ -48,30 +48,30 @@ class Patches:
         Fraction of the face.
     """
 
-    def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
+    def __init__(self, grid: Grid, faces: Surface, face, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
         self._faces = faces
-        self.here = here
+        self.face = face
         self.at = at
         self.xi = xi
         self.cell = cell
         self.x = x
         self._grid = grid
         self._renewed = renewed
-        area0 = faces.area0[here]
-        self._whole0, self._face = faces.whole0[here], faces.face[here]
+        area0 = faces.area0[face]
+        self._whole0, self._face = faces.whole0[face], faces.face[face]
         if renewed is not None:
             area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
         self._share0 = share * area0
         self.base = grid.base
         """Origin of positions, see `Grid`."""
-        around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
+        around = grid.around(interpolate(faces.domain[face], xi)) if grid.axisymmetric else 1.0
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
 
     @cached_property
     def X(self) -> NDArray[np.float64]:
         """Reference positions (n, d), m."""
-        X = self._faces.reference(self.here, self.xi)
+        X = self._faces.reference(self.face, self.xi)
         return X if self._renewed is None else self._renewed.reference(X, self.xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -115,14 +115,14 @@ class CutDomains(Keyed):
         self.pieces = cut(grid, points.corners, second) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
-        self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
-        self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
+        self._exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        self.cells, self.x = grid.local(self._exchange.send(self.pieces.cell)), self._exchange.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces in them."""
-        self.mixed = self._travel.send(self.pieces.mixed) if grid.dim == 3 and domains else None
+        self.mixed = self._exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """Their mean products of offsets in 3D, see `Pieces`."""
-        self.second = self._travel.send(self.pieces.second) if second else None
+        self.second = self._exchange.send(self.pieces.second) if second else None
         """Their mean products of all offsets (m, d, d), m^2, if `second`."""
-        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
+        self.hoop = self._exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
@@ -130,25 +130,25 @@ class CutDomains(Keyed):
 
         part (n,): number of the part of each point.
         """
-        far = np.zeros(count)
-        np.maximum.at(far, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
-        return over_all(self.grid.comm, far, MPI.MAX)
+        largest = np.zeros(count)
+        np.maximum.at(largest, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
+        return over_all(self.grid.comm, largest, MPI.MAX)
 
-    def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-        """Return for which parts (count,), see `moved`, the cut is still valid: motion up to `STAYS`."""
-        return self.moved(points, part, count) <= STAYS
+    def valid(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return for which parts (count,), see `moved`, the cut is still valid: motion up to `STILL`."""
+        return self.moved(points, part, count) <= STILL
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
-        return self._travel.send(values[self.pieces.point])
+        return self._exchange.send(values[self.pieces.point])
 
     def pieces_to_cells(self, values: NDArray) -> NDArray:
         """Send values of the pieces to the owners of their cells."""
-        return self._travel.send(values)
+        return self._exchange.send(values)
 
     def to_pieces(self, values: NDArray) -> NDArray:
         """Bring values at the integrated pieces back to the pieces of this process's points."""
-        return self._travel.back(values)
+        return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
@@ -218,16 +218,16 @@ class CutDomains(Keyed):
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 field u (nodes, d) at the points (n, d), for points without domains."""
-        travel, cells, x = self._followed
-        return travel.back(self.grid.at(cells, x, u))
+        exchange, cells, x = self._followed
+        return exchange.back(self.grid.at(cells, x, u))
 
     def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
         """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction there, m.
 
         filled (cells,): which local cells contain material.
         """
-        travel, cells, x = self._followed
-        return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
+        exchange, cells, x = self._followed
+        return (exchange.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
@@ -239,8 +239,8 @@ class CutDomains(Keyed):
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # rounding must not assign a corner on a grid line to a cell outside the domain
         cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
-        travel = Exchange(grid.comm, grid.owner(cell))
-        return travel, grid.local(travel.send(cell)), travel.send(x)
+        exchange = Exchange(grid.comm, grid.owner(cell))
+        return exchange, grid.local(exchange.send(cell)), exchange.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, of the pieces' centroids, from the corners of their domains."""

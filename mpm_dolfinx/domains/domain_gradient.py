@@ -82,11 +82,11 @@ def cell_ratios(
         Which points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
-    told = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))
+    corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))
     J, share = cut.to_cells(points.J), cut.to_cells(share)
     weight = (share > 0) * cut.to_cells(points.volume0) * cut.pieces_to_cells(cut.pieces.fraction)
-    terms = weight, weight * share, weight * J, weight * told, cut.to_cells(1.0 * flows)
+    terms = weight, weight * share, weight * J, weight * corner_ratio, cut.to_cells(1.0 * flows)
     rest, part, own, now, yielded = (sum_by(cells, term, size)[cells] for term in terms)
-    sees = (weight > 0) & (yielded == 0)
-    rest, own, now = (np.where(sees, total, 1.0) for total in (rest, own, now))
-    return np.where(sees, own / rest * (now / own) ** (part / rest), J)
+    averaged = (weight > 0) & (yielded == 0)
+    rest, own, now = (np.where(averaged, total, 1.0) for total in (rest, own, now))
+    return np.where(averaged, own / rest * (now / own) ** (part / rest), J)

@@ -53,32 +53,32 @@ class Neighbours:
         dim = bodies[0].dim
         of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.int64)
         for i, body in enumerate(bodies):
-            here = (of == i).nonzero()[0]
-            corners = (2**dim * starts[i] + body.nodes(ids[rows[here]] - starts[i]))[:, FACES[dim]]
+            chosen_rows = (of == i).nonzero()[0]
+            corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
             # equal for both sides of a face: its lowest corner, and the one diagonally opposite
             first = corners.argmin(axis=2)[:, :, None]
             ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
-            key[here] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
+            key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
         key = key.ravel()
         partner = _pairs(key)
-        self._lone = (partner < 0).nonzero()[0]
-        self._to_home = Exchange(comm, (key[self._lone] % comm.size).astype(np.int32))
-        self._there = _pairs(self._to_home.send(key[self._lone]))
-        found = self._to_home.back(self._there >= 0)
-        partner[self._lone[found]] = len(key) + found.nonzero()[0]
+        self._unpaired = (partner < 0).nonzero()[0]
+        self._exchange = Exchange(comm, (key[self._unpaired] % comm.size).astype(np.int32))
+        self._partners = _pairs(self._exchange.send(key[self._unpaired]))
+        found = self._exchange.back(self._partners >= 0)
+        partner[self._unpaired[found]] = len(key) + found.nonzero()[0]
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face, -1 without
 
-    def elsewhere(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
+    def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
         """Return a function of the face: columns and face centres of the neighbours, and which neighbours exist.
 
         own (c, k): columns of these points; faces: centres (d, k), m, of each of their faces.
         """
         centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
-        if self._to_home.comm.size > 1:
-            rows = np.concatenate([own[:, point[self._lone]], centres[:, self._lone]])
-            away = self._to_home.back(self._to_home.send(rows.T.copy())[self._there]).T
-            point = np.append(point, own.shape[1] + np.arange(len(self._lone)))
+        if self._exchange.comm.size > 1:
+            rows = np.concatenate([own[:, point[self._unpaired]], centres[:, self._unpaired]])
+            away = self._exchange.back(self._exchange.send(rows.T.copy())[self._partners]).T
+            point = np.append(point, own.shape[1] + np.arange(len(self._unpaired)))
             own, centres = (
                 np.concatenate(pair, axis=1) for pair in zip((own, centres), np.split(away, [len(own)]), strict=True)
             )
@@ -106,12 +106,12 @@ class LinearGradients:
         self._neighbours: Latest[Neighbours] = Latest()
 
     def at_pieces(
-        self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], alike: NDArray[np.float64]
+        self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `within` for elastic points (n,) of a cut; on all processes together."""
+        """Return `linear_gradients` for elastic points (n,) of a cut; on all processes together."""
         key = cut.points.id, elastic
-        return within(
-            self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, alike
+        return linear_gradients(
+            self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils
         )
 
 
@@ -123,8 +123,8 @@ def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
     return out
 
 
-def within(
-    neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], alike: NDArray[np.float64]
+def linear_gradients(
+    neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return deformation gradients (m, k, k) at the pieces of this process's points.
 
@@ -136,39 +136,39 @@ def within(
         Cut particle domains.
     F : (n, k, k)
         Deformation gradients of the points.
-    alike : (n, c)
+    soils : (n, c)
         Equal rows mark points of the same material.
     """
     # points or pieces are the last axis: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction
     d, k = cut.grid.dim, F.shape[1]
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
-    slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, alike)
-    apart = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
-    xi = [sum(inverse[a, b][of] * x for b, x in enumerate(apart)) for a in range(d)]
-    J, back = determinant(F), cofactor(F).transpose(1, 2, 0).swapaxes(0, 1)
-    e = np.einsum("ijn,ajkn->aikn", back / J, slope)
+    slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, soils)
+    offset = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
+    xi = [sum(inverse[a, b][of] * x for b, x in enumerate(offset)) for a in range(d)]
+    J, cofactors = determinant(F), cofactor(F).transpose(1, 2, 0).swapaxes(0, 1)
+    e = np.einsum("ijn,ajkn->aikn", cofactors / J, slope)
     ratio = np.trace(e, axis1=1, axis2=2)
     # the mean is weighted by volumes at rest; the second-order part would change the domain's volume, so it is removed
     shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
     for a, b in np.ndindex(d, d):
-        spread = sum_by(of, fraction * xi[a] * xi[b], len(F))
-        shift += spread * ratio[b] * slope[a]
-        second += 0.5 * spread * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
+        variance = sum_by(of, fraction * xi[a] * xi[b], len(F))
+        shift += variance * ratio[b] * slope[a]
+        second += 0.5 * variance * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
     base = F.transpose(1, 2, 0)
     base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
     out = base[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
     out = np.ascontiguousarray(out.transpose(2, 0, 1))
-    here = determinant(out)
-    if (inverted := here <= 0).any():  # their domains keep one gradient
+    ratios = determinant(out)
+    if (inverted := ratios <= 0).any():  # their domains keep one gradient
         even = np.isin(of, of[inverted])
         out[even] = F[of[even]]
-        here[even] = J[of[even]]
-    return out * (J * sum_by(of, fraction / here, len(F)))[of, None, None] ** (1 / k)
+        ratios[even] = J[of[even]]
+    return out * (J * sum_by(of, fraction / ratios, len(F)))[of, None, None] ** (1 / k)
 
 
 def _slopes(
-    neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], alike: NDArray[np.float64]
+    neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return slopes (d, k, k, r) of F by the coordinates xi of domains, and their inverse edges (d, d, r), 1/m."""
     rows = neighbours.rows
@@ -177,19 +177,19 @@ def _slopes(
     faces = [corners[bits[:, a] == end].sum(axis=0) / 2 ** (d - 1) for a in range(d) for end in (0, 1)]
     edges = np.array([faces[2 * a + 1] - faces[2 * a] for a in range(d)]).swapaxes(0, 1)
     inverse = _inverse(edges)
-    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.sum(axis=0) / 2**d, alike[rows].T])
-    others = neighbours.elsewhere(own, faces)
+    own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.sum(axis=0) / 2**d, soils[rows].T])
+    others = neighbours.at_neighbours(own, faces)
     nearest = NEAR * np.abs(edges).sum(axis=0).min(axis=0)
     A, B = np.zeros((d, d, len(rows))), np.zeros((d, k * k, len(rows)))
     for axis in range(d):
         some = np.zeros(len(rows), dtype=bool)
         for face in (2 * axis, 2 * axis + 1):
-            there, at_face, known = others(face)
+            neighbours_columns, at_face, known = others(face)
             joined = known & (np.abs(at_face - faces[face]) <= nearest).all(axis=0)
-            joined &= (there[k * k + d :] == own[k * k + d :]).all(axis=0)
-            xi = np.einsum("abn,bn->an", inverse, there[k * k : k * k + d] - own[k * k : k * k + d])
+            joined &= (neighbours_columns[k * k + d :] == own[k * k + d :]).all(axis=0)
+            xi = np.einsum("abn,bn->an", inverse, neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d])
             xi[:, ~joined] = 0.0
-            change = there[: k * k] - own[: k * k]
+            change = neighbours_columns[: k * k] - own[: k * k]
             for a in range(d):
                 B[a] += xi[a] * change
                 A[a] += xi[a] * xi

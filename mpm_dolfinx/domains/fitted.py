@@ -41,20 +41,20 @@ def fitted_at(
     """
     m = len(id)
     d = xi.shape[1]
-    here, at = points.find(id)
-    rest = edges(points.reference[at])
-    frames = [np.linalg.inv(E) for E in (rest, points.F[at][:, :d, :d] @ rest)]
+    local, at = points.find(id)
+    seeded = edges(points.reference[at])
+    frames = [np.linalg.inv(E) for E in (seeded, points.F[at][:, :d, :d] @ seeded)]
     of = (points.reference, points.corners)
-    columns = [*(interpolate(corners[at], xi[here]) for corners in of), *(E.reshape(-1, d * d) for E in frames)]
+    columns = [*(interpolate(corners[at], xi[local]) for corners in of), *(E.reshape(-1, d * d) for E in frames)]
     own = np.zeros((m, 2 * d + 2 * d * d + 1))
-    own[here] = np.column_stack([*columns, points.material[at]])
-    X, x, rest, now, material = np.split(over_all(comm, own), np.cumsum([d, d, d * d, d * d]), axis=1)
-    rest, now = (frame.reshape(m, d, d) for frame in (rest, now))
-    rest[~rest.any(axis=(1, 2))] = np.eye(d)
+    own[local] = np.column_stack([*columns, points.material[at]])
+    X, x, seeded, now, material = np.split(over_all(comm, own), np.cumsum([d, d, d * d, d * d]), axis=1)
+    seeded, now = (frame.reshape(m, d, d) for frame in (seeded, now))
+    seeded[~seeded.any(axis=(1, 2))] = np.eye(d)
     middle, last = centroids(points.reference), np.cumsum([0, *sizes])
-    probe, row = _near(middle, X, RADIUS * np.abs(np.linalg.inv(rest)).sum(axis=2).max(axis=1))
+    probe, row = _near(middle, X, RADIUS * np.abs(np.linalg.inv(seeded)).sum(axis=2).max(axis=1))
     body, own_body = (body_of(ids, last) for ids in (points.id[row], id[probe]))
-    weight = near(np.einsum("rij,rj->ri", rest[probe], middle[row] - X[probe]))
+    weight = near(np.einsum("rij,rj->ri", seeded[probe], middle[row] - X[probe]))
     weight = weight * ((body == own_body) & (points.material[row] == material[probe, 0]))
     probe, row, weight = (values[weight > 0] for values in (probe, row, weight))
     used, place = np.unique(row, return_inverse=True)
@@ -68,7 +68,7 @@ def fitted_at(
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
     """Return pairs of positions (m, d) and points at x (n, d) within a reach (m,) along each axis, all in m."""
-    low, high = ((places + way * reach[:, None]).T for way in (-1, 1))
+    low, high = ((places + sign * reach[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))
     if not len(some):

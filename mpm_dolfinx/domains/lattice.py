@@ -55,7 +55,7 @@ class Lattice:
         The body, and the number of its first point.
     given : (faces, axes)
         Faces of a side, and the components that a condition prescribes there.
-    joined : (rows, corners)
+    contacts : (rows, corners)
         Domains (m,) in contact with other bodies, and their corners (m, 4) in contact.
     """
 
@@ -64,7 +64,7 @@ class Lattice:
         body: Body,
         start: int,
         given: Iterable[tuple[Surface, Iterable[int]]],
-        joined: tuple[NDArray[np.int64], NDArray[np.int64]],
+        contacts: tuple[NDArray[np.int64], NDArray[np.int64]],
     ):
         self._body = body
         self._start = start
@@ -74,13 +74,13 @@ class Lattice:
         if isinstance(body, RowsBody):
             self._thirds = [_divided(body.corner_rows(axis)) for axis in range(self._dim)]
         self._numbers: Latest[NDArray[np.int64]] = Latest()
-        self._parted = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
+        self._tolerance = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
         # numbers of held corners: flags of all corners would be as large as the body, on every process
-        self._joined = np.unique(np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1))
+        self._contacts = np.unique(np.take_along_axis(body.nodes(contacts[0]), contacts[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
-            here = (faces.id >= self._start) & (faces.id < self._stop)
-            corners = body.nodes(faces.id[here] - self._start), FACES[self._dim][faces.face[here]]
+            own = (faces.id >= self._start) & (faces.id < self._stop)
+            corners = body.nodes(faces.id[own] - self._start), FACES[self._dim][faces.face[own]]
             for axis in axes:
                 of_axes[axis].append(np.take_along_axis(*corners, axis=1).ravel())
         self._given = [np.unique(np.concatenate(numbers)) for numbers in of_axes]
@@ -99,7 +99,7 @@ class Lattice:
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             number = self._nodes(ids)
-            return np.stack([among(number, of_axis) for of_axis in self._given], axis=2), among(number, self._joined)
+            return np.stack([among(number, of_axis) for of_axis in self._given], axis=2), among(number, self._contacts)
 
         return self._held(ids, held)
 
@@ -119,7 +119,7 @@ class Lattice:
         number = self._nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         shape = tuple(np.add(self._count, 1))
-        change = _change(comm, shape, number.ravel(), values, self._parted, self._thirds).reshape(d.shape)
+        change = _change(comm, shape, number.ravel(), values, self._tolerance, self._thirds).reshape(d.shape)
         change[self._held_of(ids)[1]] = 0.0
         return change
 
@@ -129,7 +129,7 @@ def _change(
     shape: tuple[int, ...],
     number: NDArray[np.int64],
     values: NDArray[np.float64],
-    parted: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
     thirds: Sequence[NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """Return the change (m, k) of values on a lattice by the filter.
@@ -142,19 +142,19 @@ def _change(
         Lattice sites along each axis; lexicographic number (m,) of the site of each row.  Rows may share a site.
     values : (m, k + 1)
         Values, and in the last column the number of crossed cells.
-    parted : (k + 1,)
+    tolerance : (k + 1,)
         Tolerance: if rows of a site differ by more, its domains have separated and the site is left out.
     thirds : (4, n - 3) along each axis
         Weights of third differences along n corners, for rows of several widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
-    home = starts.searchsorted(layer, side="right") - 1
-    to_home = Exchange(comm, home)
-    rows = [(to_home.send(number), to_home.send(values))]
+    rank = starts.searchsorted(layer, side="right") - 1
+    exchange = Exchange(comm, rank)
+    rows = [(exchange.send(number), exchange.send(values))]
     for other in range(-MARGIN, MARGIN + 1) if comm.size > 1 else ():  # a slab may be one layer thin
-        to = np.minimum(np.maximum(home + other, 0), comm.size - 1)
-        near = (to != home) & (to == home + other) & (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
+        to = np.minimum(np.maximum(rank + other, 0), comm.size - 1)
+        near = (to != rank) & (to == rank + other) & (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
         halo = Exchange(comm, to[near])
         rows.append((halo.send(number[near]), halo.send(values[near])))
     first = max(0, starts[comm.rank] - MARGIN)
@@ -165,14 +165,14 @@ def _change(
         field[at] = d
     for at, d in rows:
         for part in in_chunks(len(at)):
-            here = at[part]
-            field[here[(np.abs(field[here] - d[part]) > parted).any(axis=1)]] = np.nan
+            sites = at[part]
+            field[sites[(np.abs(field[sites] - d[part]) > tolerance).any(axis=1)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
     change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
     change[np.isnan(change)] = 0.0
-    return to_home.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
+    return exchange.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
 
 
 def _filtered(
@@ -201,8 +201,8 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
     The differences of quadratic functions vanish.
     """
     rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
-    apart = rows[:, None] - rows[None]
-    weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, apart).prod(axis=1)
+    distances = rows[:, None] - rows[None]
+    weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, distances).prod(axis=1)
     return 8 * weights / np.abs(weights).sum(axis=0)
 
 
@@ -230,8 +230,8 @@ def lattices(
     out = []
     for i, own in around.items():
         touching = [covers(own, other).face for j, other in around.items() if j != i]
-        covered = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *touching]))
-        out.append(Lattice(bodies[i], int(start[i]), given, (own.row[covered], own.index[covered])))
+        contacts = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *touching]))
+        out.append(Lattice(bodies[i], int(start[i]), given, (own.row[contacts], own.index[contacts])))
     return out
 
 

@@ -131,45 +131,45 @@ class Reconstruction:
     def __init__(self, grid: Grid):
         self.grid = grid
         self._slope = fem.Function(grid.cellwise((grid.dim,)))
-        self._neighbour = grid.beside(np.arange(grid.num_owned))
+        self._neighbour = grid.neighbours(np.arange(grid.num_owned))
 
     def __call__(
-        self, seen: CellPressures, origin: NDArray[np.float64]
+        self, pressures: CellPressures, origin: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return slopes (n, d), Pa/m, and bounds (n, 2), Pa, of the pressures of cells.
 
         origin (n, d), m: position of the cell's pressure relative to its midpoint.
         """
-        cells, p, centroid, *_ = seen
-        jump, one_sided, _, drained = self._differences(seen)
-        slope, low, high = van_leer(one_sided), *_spread(jump)
+        cells, p, centroid, *_ = pressures
+        jump, one_sided, _, drained = self._differences(pressures)
+        slope, low, high = van_leer(one_sided), *_bounds_of(jump)
         whole = self.grid.sizes(cells)[..., None] * [-0.5, 0.5]
         filled = (2 * centroid[cells][:, :, None] - whole[..., ::-1]).clip(whole[..., :1], whole[..., 1:])
         ends = slope[:, :, None] * (np.where(drained, filled, whole) - origin[:, :, None])
         scale = np.ones(len(cells))
-        for reach, room in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
-            scale = np.minimum(scale, np.divide(room, reach, out=np.ones(len(cells)), where=reach != 0))
+        for end, bound in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
+            scale = np.minimum(scale, np.divide(bound, end, out=np.ones(len(cells)), where=end != 0))
         return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
 
-    def _differences(self, seen: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return differences and slopes to neighbours and drained sides, and which neighbours and sides exist.
 
         All (n, d, 2), by axis and end; zero without a neighbour or drained side.
         """
-        cells, p, centroid, faces, outer = seen
-        there, here = self._neighbour[cells], cells[:, None, None]
+        cells, p, centroid, faces, outer = pressures
+        neighbours, own = self._neighbour[cells], cells[:, None, None]
         axis, end = np.arange(self.grid.dim)[:, None], np.arange(2)
-        way = 2 * end - 1
-        is_open = (there >= 0) & (faces[cells] > 0) & (faces[there, axis, 1 - end] > 0)
-        jump = np.where(is_open, p[there] - p[here], 0.0)
-        apart = self.grid.between(here, there, axis) + way * (centroid[there, axis] - centroid[here, axis])
-        one_sided = way * jump / np.where(is_open, apart, 1.0)
+        sign = 2 * end - 1
+        is_open = (neighbours >= 0) & (faces[cells] > 0) & (faces[neighbours, axis, 1 - end] > 0)
+        jump = np.where(is_open, p[neighbours] - p[own], 0.0)
+        distance = self.grid.between(own, neighbours, axis) + sign * (centroid[neighbours, axis] - centroid[own, axis])
+        one_sided = sign * jump / np.where(is_open, distance, 1.0)
         drained = ~is_open & np.isfinite(outer[..., 0])
         jump, one_sided = np.where(drained, outer[..., 0], jump), np.where(drained, outer[..., 1], one_sided)
         return jump, one_sided, is_open, drained
 
     def up_to_surface(
-        self, seen: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
+        self, pressures: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at positions in owned cells (n,), of second order also in cells at the surface.
 
@@ -184,22 +184,22 @@ class Reconstruction:
         slot : (m,)
             Index of the cell of each position among the owned cells.
         """
-        cells, p, centroid, *_ = seen
-        jump, one_sided, is_open, drained = self._differences(seen)
+        cells, p, centroid, *_ = pressures
+        jump, one_sided, is_open, drained = self._differences(pressures)
         slope = van_leer(one_sided)
         at, axis = np.nonzero(is_open.any(axis=2) & ~(is_open | drained).all(axis=2))
         end = is_open[at, axis, 1].astype(int)
-        to, there = one_sided[at, axis, end], self._neighbour[cells][at, axis, end]
-        before = self._everywhere(cells, slope)[there, axis]
+        to, inner = one_sided[at, axis, end], self._neighbour[cells][at, axis, end]
+        before = self._everywhere(cells, slope)[inner, axis]
         same = before * to > 0
         slope[at, axis] = np.where(same, np.sign(to) * np.minimum(np.abs(before), np.abs(2 * to - before)), 0.0)
-        way = 1 - 2 * end
-        reach = self.grid.along(cells[at], axis) / 2 - way * centroid[cells[at], axis]
-        on = way * slope[at, axis] * reach
-        low, high = _spread(jump)
+        sign = 1 - 2 * end
+        depth = self.grid.along(cells[at], axis) / 2 - sign * centroid[cells[at], axis]
+        on = sign * slope[at, axis] * depth
+        low, high = _bounds_of(jump)
         low, high = low + sum_by(at, np.minimum(on, 0), len(cells)), high + sum_by(at, np.maximum(on, 0), len(cells))
-        rise = np.einsum("md,md->m", slope[slot], x - centroid[cells[slot]])
-        return p[cells[slot]] + share_within(rise, low, high, slot)[slot] * rise
+        increment = np.einsum("md,md->m", slope[slot], x - centroid[cells[slot]])
+        return p[cells[slot]] + share_within(increment, low, high, slot)[slot] * increment
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return slopes of owned cells (n, d) as an array over local cells, including active ghosts."""
@@ -216,16 +216,16 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def share_within(
-    rise: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
+    increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Return the largest factors (n,) by which all rises (m,) in a cell stay between its low and high (n,)."""
-    room, share = np.where(rise > 0, high[slot], low[slot]), np.ones(len(low))
-    beyond = (np.abs(rise) > np.abs(room)).nonzero()[0]
-    np.minimum.at(share, slot[beyond], room[beyond] / rise[beyond])
+    bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
+    excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
+    np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
     return share
 
 
-def _spread(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the smallest difference, <= 0, and the largest, >= 0, to neighbours (n,), of differences (n, d, 2)."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
@@ -242,34 +242,34 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     match = (old_key[at] == new_key).nonzero()[0]
     before = at[match]
 
-    stays = np.zeros(len(new_key))
-    stays[match] = np.minimum(new.fraction[match], old.fraction[before])
-    leaves = old.fraction.copy()
-    leaves[before] -= stays[match]
-    left = sum_by(owner, leaves, n)
-    share = stays / new.fraction
+    common = np.zeros(len(new_key))
+    common[match] = np.minimum(new.fraction[match], old.fraction[before])
+    left_fraction = old.fraction.copy()
+    left_fraction[before] -= common[match]
+    leaving = sum_by(owner, left_fraction, n)
+    share = common / new.fraction
 
-    def passed_on(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def remapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values of the new pieces: the old value on the common part, elsewhere the mean of parts that left."""
-        mean = np.divide(sum_by(owner, leaves * values, n), left, out=np.zeros(n), where=left > 0)
-        kept = np.zeros(len(new_key))
-        kept[match] = values[before]
-        return share * kept + (1 - share) * mean[new.point]
+        mean = np.divide(sum_by(owner, left_fraction * values, n), leaving, out=np.zeros(n), where=leaving > 0)
+        old_values = np.zeros(len(new_key))
+        old_values[match] = values[before]
+        return share * old_values + (1 - share) * mean[new.point]
 
-    pressure = passed_on(old.pressure)
-    amiss = np.zeros(len(new_key))
+    pressure = remapped(old.pressure)
+    correction = np.zeros(len(new_key))
     for axis in range(old.x.shape[1]):
         slope = sum_by(owner, old.fraction * old.slope[:, axis], n)
         then = old.x[:, axis] - sum_by(owner, old.fraction * old.x[:, axis], n)[owner]
         now = new.x[:, axis] - sum_by(new.point, new.fraction * new.x[:, axis], n)[new.point]
-        amiss += slope[new.point] * (now - passed_on(then))
-    return pressure + _within(amiss, pressure, old, owner, new) * amiss
+        correction += slope[new.point] * (now - remapped(then))
+    return pressure + _limited(correction, pressure, old, owner, new) * correction
 
 
-def _within(amiss, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
+def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
     """Return the factor (m,) of a correction, equal for all pieces of a domain, that respects the bounds."""
     first = np.diff(owner, prepend=-1).nonzero()[0]
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
-    room = np.where(amiss > 0, high[new.point] - pressure, low[new.point] - pressure)
-    share = np.divide(room, amiss, out=np.ones(len(amiss)), where=amiss != 0).clip(0, 1)
+    margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
+    share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0).clip(0, 1)
     return np.minimum.reduceat(share, np.diff(new.point, prepend=-1).nonzero()[0])[new.point]

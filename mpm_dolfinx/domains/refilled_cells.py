@@ -27,7 +27,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
-APART = 0.01
+GAP = 0.01
 """Largest gap, in cells, between faces of two domains that still form one surface.
 
 Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
@@ -91,8 +91,8 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
     ring = corners[:, RING] / grid.h if grid.even else grid.in_cells(corners)[:, RING]
     edge = np.roll(ring, -1, axis=1) - ring
     parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
-    turned = parts.min(axis=0, initial=0.0) < -CRUMB * grid.sizes_at(corners.mean(axis=1)).prod(axis=-1)
-    return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | turned
+    inverted = parts.min(axis=0, initial=0.0) < -CRUMB * grid.sizes_at(corners.mean(axis=1)).prod(axis=-1)
+    return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | inverted
 
 
 class RefilledCells:
@@ -126,14 +126,14 @@ class RefilledCells:
         self.cells = grid.cells
         self.faces = faces
         self.parts = self._parts(faces)
-        barred = self._barred(flowed, signs)
-        self.passed, self.region = self._chains(barred)
+        excluded = self._excluded(flowed, signs)
+        self.crossed, self.region = self._chains(excluded)
         size = self.pieces.fraction * np.abs(volumes(points.corners))[self.pieces.point] / self._volume(self.cell)
-        filled = np.where(self.passed, self.region.area_of(self.cells), 1.0)
-        barred |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
-        self.chosen = self._chosen(flowed & needs, barred, size < SMALL)
+        filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
+        excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
+        self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
         """Cells to renew."""
-        self.gone = self._at(self.chosen)
+        self.affected = self._at(self.chosen)
         """Which points (n,) lose their domains or parts of them."""
 
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
@@ -146,36 +146,36 @@ class RefilledCells:
         out[self.pieces.point[cells[self.cell]]] = True
         return out
 
-    def _barred(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
+    def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
         """Return cells that cannot be renewed: with other soil, several bodies, or faces with different conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
         np.minimum.at(low, cell, self.body[of])
         np.maximum.at(high, cell, self.body[of])
-        barred = low != high
-        barred[cell[~flowed[of]]] = True
+        excluded = low != high
+        excluded[cell[~flowed[of]]] = True
         sign = signs[1][np.searchsorted(signs[0], self.faces.key[parts.row])]
-        barred[parts.cell[sign == NONE]] = True
+        excluded[parts.cell[sign == NONE]] = True
         place = 5 * parts.cell + parts.side + 1  # inside the cell, or on one of its sides
         least, most = np.full(5 * self.cells, np.iinfo(np.int64).max), np.full(5 * self.cells, -1)
         np.minimum.at(least, place, sign)
         np.maximum.at(most, place, sign)
-        barred[np.flatnonzero((most > least) & (most >= 0)) // 5] = True
-        return barred
+        excluded[np.flatnonzero((most > least) & (most >= 0)) // 5] = True
+        return excluded
 
     def _chosen(
-        self, needed: NDArray[np.bool_], barred: NDArray[np.bool_], small: NDArray[np.bool_]
+        self, needed: NDArray[np.bool_], excluded: NDArray[np.bool_], small: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Return the cells to renew: cells of points (n,) that need it, and cells with small remainders of domains."""
         of, cell = self.pieces.point, self.cell
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[needed[of]]] = True
-        chosen &= ~barred
+        chosen &= ~excluded
         more = chosen
         while more.any():
             more = np.zeros(self.cells, dtype=bool)
-            more[cell[self._at(chosen)[of] & small & ~(barred | chosen)[cell]]] = True
+            more[cell[self._at(chosen)[of] & small & ~(excluded | chosen)[cell]]] = True
             chosen |= more
         return chosen
 
@@ -192,54 +192,54 @@ class RefilledCells:
             s, row = sliced(s, row, axis, grid)
         s = slices_in_cells(grid, s)
         s = np.where((s[0, 2] <= s[1, 2])[None, None], s, s[::-1])
-        way = s[1, :2] - s[0, :2]
-        size = np.hypot(*way)
+        edge_vector = s[1, :2] - s[0, :2]
+        size = np.hypot(*edge_vector)
         some = size > NEAR
-        s, way = s[:, :, some], way[:, some]
+        s, edge_vector = s[:, :, some], edge_vector[:, some]
         row, size = row[some], size[some]
-        outward = np.stack([way[1], -way[0]]) / size
+        outward = np.stack([edge_vector[1], -edge_vector[0]]) / size
         middle = s[:, :2].mean(axis=0)
-        flat = np.abs(way) < grid.snap[:, None]
+        flat = np.abs(edge_vector) < grid.snap[:, None]
         on = flat & (np.abs(middle - np.rint(middle)) < grid.snap[:, None])
         index = np.floor(np.where(on, np.rint(middle) - (outward > 0), middle)).astype(np.int64)
         index = np.clip(index, 0, (grid.shape - 1)[:, None])
         side = np.where(on[0], np.where(outward[0] > 0, 1, 0), np.where(on[1], np.where(outward[1] > 0, 3, 2), NONE))
         return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
 
-    def _chains(self, barred: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
+    def _chains(self, excluded: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
         """Return the cells crossed by the surface, and the material region of cells that it crosses once.
 
         Cells crossed more than once are barred.
         """
         inner = self.parts.side == NONE
         cell, x = self.parts.cell[inner], self.parts.x[inner]
-        passed = np.zeros(self.cells, dtype=bool)
-        passed[cell] = True
+        crossed = np.zeros(self.cells, dtype=bool)
+        crossed[cell] = True
         on = (np.minimum(x, 1 - x) < NEAR).any(axis=2)
         starts, ends = (np.flatnonzero(on[:, k]) for k in (0, 1))
-        once = passed.copy()
-        way = np.stack([sum_by(cell, column, self.cells) for column in (x[:, 1] - x[:, 0]).T], axis=1)
+        once = crossed.copy()
+        chord = np.stack([sum_by(cell, column, self.cells) for column in (x[:, 1] - x[:, 0]).T], axis=1)
         P, Q = np.zeros((self.cells, 2)), np.zeros((self.cells, 2))
         for at, k, place in ((starts, 0, P), (ends, 1, Q)):
             once &= np.bincount(cell[at], minlength=self.cells) == 1
             place[cell[at]] = x[at, k]
-        once &= np.abs(Q - P - way).max(axis=1) < APART
-        once &= np.linalg.norm(Q - P, axis=1) > APART
+        once &= np.abs(Q - P - chord).max(axis=1) < GAP
+        once &= np.linalg.norm(Q - P, axis=1) > GAP
         a, b = x[:, 0] - P[cell], x[:, 1] - P[cell]
         along = np.einsum("mi,mi->m", a + b, (Q - P)[cell])
         order = np.lexsort((along, cell))
         order = order[once[cell[order]]]
         cell, x = cell[order], x[order]
-        apart = (np.abs(x[1:, 0] - x[:-1, 1]).max(axis=1) > APART) & (cell[1:] == cell[:-1])
-        once[cell[1:][apart]] = False
-        barred |= passed & ~once
+        open_chains = (np.abs(x[1:, 0] - x[:-1, 1]).max(axis=1) > GAP) & (cell[1:] == cell[:-1])
+        once[cell[1:][open_chains]] = False
+        excluded |= crossed & ~once
         kept = once[cell]
         cell, x = cell[kept], x[kept]
         at = np.flatnonzero(once)
         surface = resampled(np.searchsorted(at, cell), x, P[at], Q[at])
         region = Region(at, surface)
-        barred[at[~region.sound]] = True
-        return passed, region
+        excluded[at[~region.simple]] = True
+        return crossed, region
 
     # ---- new domains ----------------------------------------------------------------------------
 
@@ -255,12 +255,12 @@ class RefilledCells:
 
     def full(self) -> New:
         """Return the new domains of full cells."""
-        cells = np.flatnonzero(self.chosen & ~self.passed)
+        cells = np.flatnonzero(self.chosen & ~self.crossed)
         bits = corner_bits(2)
         y = (bits[:, None] + bits[None]) / 2  # (4 domains, 4 corners, 2)
         of = np.repeat(cells, 4)
         local = np.tile(y, (len(cells), 1, 1))
-        return self._beside(of, local, *_no_faces(len(of)))
+        return self._partial(of, local, *_no_faces(len(of)))
 
     def partial(self) -> New:
         """Return the new domains of cells crossed by the surface."""
@@ -278,7 +278,7 @@ class RefilledCells:
         edge = np.linalg.norm(upper - lower, axis=1)
         total = sum_by(cells[at], edge, self.cells)  # of all new edges on the surface
         area[at, face] = edge / total[cells[at]] * whole[cells[at]]
-        return self._beside(cells, local, parent, area, ends)
+        return self._partial(cells, local, parent, area, ends)
 
     def _nearest(
         self,
@@ -296,12 +296,12 @@ class RefilledCells:
         stop = np.searchsorted(parts.cell[order], cells, side="right")
         edge, at = ranges(first, stop - first)
         part = order[at]
-        a, way = parts.x[part, 0], parts.x[part, 1] - parts.x[part, 0]
+        a, edge_vector = parts.x[part, 0], parts.x[part, 1] - parts.x[part, 0]
         found = []
         for place in ((lower + upper) / 2, lower, upper):
-            share = np.einsum("ri,ri->r", place[edge] - a, way) / np.maximum((way**2).sum(axis=1), TINY)
+            share = np.einsum("ri,ri->r", place[edge] - a, edge_vector) / np.maximum((edge_vector**2).sum(axis=1), TINY)
             share = np.clip(share, 0.0, 1.0)
-            far = np.linalg.norm(a + share[:, None] * way - place[edge], axis=1)
+            far = np.linalg.norm(a + share[:, None] * edge_vector - place[edge], axis=1)
             best = np.lexsort((far, edge))
             best = best[np.searchsorted(edge[best], np.arange(len(cells)))]
             t0, t1 = parts.t[part[best]].T
@@ -312,12 +312,12 @@ class RefilledCells:
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (m, 2), m, of coordinates t (m,) on faces, from 0 at their start to 1."""
         face = self.faces.face[row]
-        turned = START[face] != FACES[2][face, 0]
-        share = np.where(turned, 1 - t, t)[:, None]
+        flipped = START[face] != FACES[2][face, 0]
+        share = np.where(flipped, 1 - t, t)[:, None]
         low, high = self.faces.ends[row].transpose(1, 0, 2)
         return low + share * (high - low)
 
-    def _beside(
+    def _partial(
         self,
         cells: NDArray[np.int64],
         local: NDArray[np.float64],
@@ -348,31 +348,31 @@ class RefilledCells:
                 at = np.flatnonzero(flat & np.isin(4 * cells + side, known))
                 if not len(at):
                     continue
-                here = 4 * cells[at] + side
-                key, X = self._nearest(bordered, order, here, a[at], b[at])
+                sides = 4 * cells[at] + side
+                key, X = self._nearest(bordered, order, sides, a[at], b[at])
                 middle = (a[at, 1 - axis] + b[at, 1 - axis]) / 2
-                covered = (middle > low[here]) & (middle < high[here])
-                at, here = at[covered], here[covered]
+                covered = (middle > low[sides]) & (middle < high[sides])
+                at, sides = at[covered], sides[covered]
                 key, X = key[covered], X[covered]
                 parent[at, face], ends[at, face] = key, X
-                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[here]
+                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[sides]
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
 
     @property
-    def rest(self) -> New:
+    def remainders(self) -> New:
         """Remainders of removed domains outside the renewed cells."""
-        return self._rest[0]
+        return self._remainders[0]
 
     @property
-    def left(self) -> NDArray[np.int64]:
+    def outside(self) -> NDArray[np.int64]:
         """Pieces of removed domains outside the renewed cells."""
-        return self._rest[1]
+        return self._remainders[1]
 
     @cached_property
-    def _rest(self) -> tuple[New, NDArray[np.int64]]:
+    def _remainders(self) -> tuple[New, NDArray[np.int64]]:
         """Remainders of removed domains outside the renewed cells, each piece a group; and these pieces."""
         pieces, points = self.pieces, self.points
-        left = np.flatnonzero(self.gone[pieces.point] & ~self.chosen[self.cell])
+        left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
         left = left[area > CRUMB * self._volume(self.cell[left])]
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
@@ -382,9 +382,9 @@ class RefilledCells:
         polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
-        sound = Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece])
-        piece, quads = piece[sound], quads[sound]
-        edge = edge[sound]
+        large = Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece])
+        piece, quads = piece[large], quads[large]
+        edge = edge[large]
         left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
         corners[:, RING] = quads
@@ -399,9 +399,9 @@ class RefilledCells:
             face = SIDE[k]
             old = points.corners[faces.point[row]]
             low, high = (old[np.arange(len(row)), FACES[2][faces.face[row], e]] for e in (0, 1))
-            way = high - low
+            chord = high - low
             t = [
-                np.einsum("ri,ri->r", corners[at, c] - low, way) / np.maximum((way**2).sum(axis=1), TINY)
+                np.einsum("ri,ri->r", corners[at, c] - low, chord) / np.maximum((chord**2).sum(axis=1), TINY)
                 for c in FACES[2][face]
             ]
             parent[at, face] = faces.key[row]
@@ -412,7 +412,7 @@ class RefilledCells:
 
     # ---- transfer of values ---------------------------------------------------------------------
 
-    def rise(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
+    def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the slopes (n, 2, k), 1/m, of values (points, k) in the cells of new domains.
 
         They are a least-squares fit to the pieces in the cell.
@@ -431,17 +431,18 @@ class RefilledCells:
         right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
         value, axes = np.linalg.eigh(normal)
         some = value > SAME  # cells squared: pieces in a row determine no slope across the row
-        back = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
-        slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / grid.sizes_of(np.arange(self.cells))[..., None]
-        return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.left]])[group]]
+        inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
+        sizes = grid.sizes_of(np.arange(self.cells))[..., None]
+        slope = (axes * inverse[:, None]) @ axes.swapaxes(1, 2) @ right / sizes
+        return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.outside]])[group]]
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
         """Pieces of removed domains, the group that receives each, and its fraction of its domain."""
         pieces = self.pieces
-        into = np.flatnonzero(self.chosen[self.cell] & self.gone[pieces.point])
-        piece = np.concatenate([into, self.left])
-        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.left))])
+        into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
+        piece = np.concatenate([into, self.outside])
+        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.outside))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
         return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped slivers
@@ -479,7 +480,7 @@ class RefilledCells:
         number = self._group(cell)
         whole = np.maximum(sum_by(number, length, count), TINY)
         means = np.stack([sum_by(number, length * column, count) / whole for column in flat.T], axis=1)
-        pieces = values[self.pieces.point[self.left]].reshape(len(self.left), flat.shape[1])
+        pieces = values[self.pieces.point[self.outside]].reshape(len(self.outside), flat.shape[1])
         out = np.concatenate([means, pieces])[group] * (parent != NONE).any(axis=1)[:, None]
         return out.reshape(len(corners), *values.shape[1:])
 
@@ -508,9 +509,9 @@ def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -
         kept = [[(0, 1, NONE, NONE), (NONE, 2, NONE, 3)], [(1, 2, NONE, NONE), (NONE, 3, NONE, 0)]]
         areas = np.array([[Polygons.rings(ring[at][:, list(half)]).area for half in two] for two in halves])
         best = areas.min(axis=1).argmax(axis=0)
-        for way in (0, 1):
-            for half, numbers in zip(halves[way], kept[way], strict=True):
-                rows = at[best == way]
+        for diagonal in (0, 1):
+            for half, numbers in zip(halves[diagonal], kept[diagonal], strict=True):
+                rows = at[best == diagonal]
                 rows = rows[Polygons.rings(ring[rows][:, list(half)]).area > 0]
                 number = np.array([SIDE[k] if k != NONE else NONE for k in numbers])
                 out.append((ring[rows][:, list(half)], np.tile(number, (len(rows), 1))))

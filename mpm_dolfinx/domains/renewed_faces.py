@@ -106,15 +106,15 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the interval (m,), (m,), in [0, 1], in which edges with ends (m, 2, 2), m, lie in a region (2, 2), m."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
-    way = ends[:, 1] - ends[:, 0]
-    slack = SAME * np.abs(way).max(axis=1)
+    edge_vector = ends[:, 1] - ends[:, 0]
+    slack = SAME * np.abs(edge_vector).max(axis=1)
     for axis in range(2):
         for end, sign in ((0, 1.0), (1, -1.0)):
-            beyond = sign * (ends[:, 0, axis] - region[end, axis])
-            slope = sign * way[:, axis]
+            excess = sign * (ends[:, 0, axis] - region[end, axis])
+            slope = sign * edge_vector[:, axis]
             flat = np.abs(slope) <= slack
-            t = -beyond / np.where(flat, 1.0, slope)
+            t = -excess / np.where(flat, 1.0, slope)
             low = np.where(~flat & (slope > 0), np.maximum(low, t), low)
             high = np.where(~flat & (slope < 0), np.minimum(high, t), high)
-            high = np.where(flat & (beyond < -slack), low, high)
+            high = np.where(flat & (excess < -slack), low, high)
     return low, high

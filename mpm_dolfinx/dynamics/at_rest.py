@@ -49,7 +49,7 @@ def borne(
     patches = cut.surfaces(list(surfaces.values()))
     area, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("area0", "x"))
     own = np.concatenate([p.area(points) for p in patches])
-    stress = np.concatenate([of[p.here, :d, :d] for of, p in zip(stresses.values(), patches, strict=True)])
+    stress = np.concatenate([of[p.face, :d, :d] for of, p in zip(stresses.values(), patches, strict=True)])
     t = np.einsum("nij,nj->ni", stress, own) / area[:, None]
     travel, places = owners(grid, patches)
     part, nodes = travel.back(parts.cells[places.cells]), parts.nodes[: len(forces)]

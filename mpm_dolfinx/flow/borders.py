@@ -20,7 +20,7 @@ from mpm_dolfinx.base.fluid_content import mean_density
 from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, Mobility
 from mpm_dolfinx.flow.layers import MixedCells
-from mpm_dolfinx.flow.series import Ways, none, through
+from mpm_dolfinx.flow.series import Paths, none, through
 from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 
 
@@ -31,7 +31,7 @@ class Borders:
     ----------
     contents
         Contents of the cells.
-    cells, alike, law
+    cells, soils, law
         Cells of pieces (m,), rows (m, k) that are equal for equal soil, and numbers of their retention curves.
     facets
         Faces of this process between two active cells.
@@ -43,14 +43,14 @@ class Borders:
         self,
         contents: CellContents,
         cells: NDArray[np.int32],
-        alike: NDArray[np.float64],
+        soils: NDArray[np.float64],
         law: NDArray[np.int64],
         facets: NDArray[np.int32],
         mixed: MixedCells | None,
     ):
         self.grid = grid = contents.grid
-        known = np.zeros((grid.num_local, 2 + alike.shape[1]))
-        known[cells, 1:] = np.column_stack([law, alike])
+        known = np.zeros((grid.num_local, 2 + soils.shape[1]))
+        known[cells, 1:] = np.column_stack([law, soils])
         self.mixed = np.full(grid.num_local, -1)
         """Index of each local cell among the owned mixed cells, else -1."""
         if mixed is not None:
@@ -61,13 +61,13 @@ class Borders:
         self._law = known[:, 1].astype(np.int64)
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
-        self.facets, self.alike = facets[differ], facets[~differ]
+        self.facets, self.uniform = facets[differ], facets[~differ]
         """Faces of this process between cells of different soil, and the other faces."""
-        way = grid.midpoints[grid.facet_cells[self.facets]]
-        way = way[:, 1] - way[:, 0]
-        self._axis = np.abs(way).argmax(axis=1)
-        falls = np.take_along_axis(way, self._axis[:, None], axis=1) < 0
-        self._pair = np.where(falls, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
+        offset = grid.midpoints[grid.facet_cells[self.facets]]
+        offset = offset[:, 1] - offset[:, 0]
+        self._axis = np.abs(offset).argmax(axis=1)
+        downward = np.take_along_axis(offset, self._axis[:, None], axis=1) < 0
+        self._pair = np.where(downward, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
         of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # for requests of others
         self._cells = np.unique(np.append(self._pair, of_others))
         self._slot = np.searchsorted(self._cells, self._pair)
@@ -87,20 +87,20 @@ class Borders:
             Of the local cells (c, d), m: positions of their pressures from their midpoints, and displacements.
         """
         grid, d = self.grid, self.grid.dim
-        ways, slots = flow.mobility.ways, 1
-        if ways is not None:
-            slots = ways.law.shape[-1]
+        paths, slots = flow.mobility.paths, 1
+        if paths is not None:
+            slots = paths.law.shape[-1]
             plain = replace(flow, mobility=Mobility(np.ones(len(contents.filled))))
-            held = contents.slot(np.flatnonzero(self.mixed >= 0))
-            ways = ways.eased(plain.along(d)[held])
+            mixed_slots = contents.slot(np.flatnonzero(self.mixed >= 0))
+            paths = paths.eased(plain.along(d)[mixed_slots])
         slots = grid.comm.allreduce(slots, MPI.MAX)
         own = np.flatnonzero(self._cells < grid.num_owned)
         cells, along = self._cells[own], flow.along(d)
         out = none(len(self._cells), len(laws.scales), slots).everywhere(d)
-        out.beside[own, :, :, self._law[cells]] = along[contents.slot(cells)][:, :, None]
+        out.parallel[own, :, :, self._law[cells]] = along[contents.slot(cells)][:, :, None]
         mixed = self.mixed[cells] >= 0
-        if ways is not None:
-            for of, given in zip(out, ways.with_slots(slots), strict=True):
+        if paths is not None:
+            for of, given in zip(out, paths.with_slots(slots), strict=True):
                 of[own[mixed]] = given[self.mixed[cells[mixed]]]
         out = self._from_others(out)
         (first, other), axis = self._pair, self._axis
@@ -111,10 +111,10 @@ class Borders:
         lengths = [
             across[i] / 2 - sign * places[cells, axis] for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
         ]
-        lengths = [np.maximum(length, EPSILON * way) for length, way in zip(lengths, across, strict=True)]
-        gone = moved + places - contents.centroid
-        drift = (gone[other] - gone[first]) / 2  # both cells share the motion of the face
-        apart = [
+        lengths = [np.maximum(length, EPSILON * edge) for length, edge in zip(lengths, across, strict=True)]
+        shift = moved + places - contents.centroid
+        drift = (shift[other] - shift[first]) / 2  # both cells share the motion of the face
+        offsets = [
             across[i][:, None] / 2 * unit - sign * contents.centroid[cells] + drift
             for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
         ]
@@ -122,7 +122,7 @@ class Borders:
         area = area * np.broadcast_to(grid.volumes(first), len(axis)) / across[0]
         two = [out.at(self._slot[0], axis, 1), out.at(self._slot[1], axis, 0)]
         weight = np.zeros(d) if flow.weight is None else flow.weight
-        return BorderFaces(self, flow.mobility, laws, self._pair, area, two, lengths, apart, weight, flow.bulk)
+        return BorderFaces(self, flow.mobility, laws, self._pair, area, two, lengths, offsets, weight, flow.bulk)
 
     def through_sides(
         self,
@@ -132,7 +132,7 @@ class Borders:
         normal: NDArray[np.float64],
         p: NDArray[np.float64],
         outer: NDArray[np.float64],
-        fall: NDArray[np.float64],
+        drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
         """Yield rows of owned mixed cells, and their k_r (k,) and slopes: see `Relative`."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
@@ -144,29 +144,29 @@ class Borders:
         across = mobility.mean[slot] * (share * mobility.share[slot]).sum(axis=1)
         found, ones = np.zeros((2, count)), np.ones(count)
         for axis in range(normal.shape[1]):
-            way = mobility.ways.at(mixed, axis, (normal[rows, axis] > 0).astype(np.int64))
-            some = through(laws, (p[rows], outer[rows]), [way], [ones], [fall[rows]])
+            path = mobility.paths.at(mixed, axis, (normal[rows, axis] > 0).astype(np.int64))
+            some = through(laws, (p[rows], outer[rows]), [path], [ones], [drop[rows]])
             found += share[:, axis] * np.stack([some.conductance, some.slopes[0]])
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
-    def _from_others(self, ways: Ways) -> Ways:
+    def _from_others(self, paths: Paths) -> Paths:
         """Return ways of the cells at these faces, with ghosts from their owners."""
         if self.grid.comm.size == 1:
-            return ways
-        columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in ways]
+            return paths
+        columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
         width = np.cumsum([column.shape[1] for column in columns])
         rows = np.zeros((self.grid.num_local, width[-1]))
         rows[self._cells] = np.concatenate(columns, axis=1)
         found = np.split(with_ghosts(self.grid.cellwise(), rows)[self._cells], width[:-1], axis=1)
-        return Ways(*(part.reshape(of.shape).astype(of.dtype) for part, of in zip(found, ways, strict=True)))
+        return Paths(*(part.reshape(of.shape).astype(of.dtype) for part, of in zip(found, paths, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class BorderFaces:
     """Faces between cells of different soil, with their conductivities.
 
-    borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); ways,
-    lengths, apart: of both cells, see `through`, and vectors (m, d), m; weight (d,), N/m^3, bulk, Pa: of the fluid.
+    borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); paths,
+    lengths, offsets: of both cells, see `through`, and vectors (m, d), m; weight (d,), N/m^3, bulk, Pa: of the fluid.
     """
 
     borders: Borders
@@ -174,9 +174,9 @@ class BorderFaces:
     laws: Any
     pair: NDArray[np.int64]
     area: NDArray[np.float64]
-    ways: list[Ways]
+    paths: list[Paths]
     lengths: list[NDArray[np.float64]]
-    apart: list[NDArray[np.float64]]
+    offsets: list[NDArray[np.float64]]
     weight: NDArray[np.float64]
     bulk: float
 
@@ -187,10 +187,10 @@ class BorderFaces:
             if force is None
             else self.weight + with_ghosts(self.borders.grid.cellwise(), force)[self.pair].mean(0)
         )
-        falls = [(way * weight).sum(axis=1) for way in self.apart]
-        found = through(self.laws, p, self.ways, self.lengths, falls)
+        drops = [(offset * weight).sum(axis=1) for offset in self.offsets]
+        found = through(self.laws, p, self.paths, self.lengths, drops)
         density = self.area * mean_density(*p, self.bulk)
-        flux = density * found.conductance * (p[0] - p[1] + sum(falls))
+        flux = density * found.conductance * (p[0] - p[1] + sum(drops))
         return BorderFlows(self.pair, flux, [density * slope for slope in found.slopes])
 
 

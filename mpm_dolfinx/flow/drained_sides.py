@@ -117,17 +117,17 @@ class DrainedSides(Feeding):
         pressure, flux, one_way, driest = values[:, 1:5].T
         area = values[:, 5:]
         drains = np.isfinite(pressure)
-        size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
+        size, offset = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
         least = wet.contents.fill[wet.contents.slot(cell)] * grid.sizes(cell).min(axis=-1) / THICK / (grid.dim + 1)
         normal = area / size[:, None]
-        distance = np.einsum("md,md->m", reach, normal)
+        distance = np.einsum("md,md->m", offset, normal)
         shape = size / np.maximum(distance, least)
         if grid.axisymmetric:  # circumference half-way to the centroid
             shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
         rains = np.isfinite(driest)
         given, rain = np.where(rains, 0.0, flux * size), np.where(rains, flux * size, np.nan)
-        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, reach, rain, driest)
+        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, offset, rain, driest)
 
 
 @dataclass(frozen=True)
@@ -136,14 +136,14 @@ class OpenFaces:
 
     at (m,): index of the cell among the n active owned cells; conductance, inflow (m,): outflow per unit of the cell's
     mass potential, m^d/(Pa s), and inflow, prescribed or by the outer pressure, m^d/s; seeps (m,): outflow only;
-    reach (m, d): vector from the cell's centroid, m.
+    offset (m, d): vector from the cell's centroid, m.
     """
 
     at: NDArray[np.int64]
     conductance: NDArray[np.float64]
     inflow: NDArray[np.float64]
     seeps: NDArray[np.bool_]
-    reach: NDArray[np.float64]
+    offset: NDArray[np.float64]
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,) if it were open in both directions, m^d/s."""
@@ -153,17 +153,17 @@ class OpenFaces:
         """Return the outflow through each face (m,) per unit of the cell's mass potential, m^d/(Pa s)."""
         return self.conductance
 
-    rises = open_by
+    derivative = open_by
 
-    def aslant(
-        self, fluid: Fluid, beyond: NDArray[np.float64]
+    def nonorthogonal(
+        self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction for a pressure difference (m,), Pa: a flow, m^d/s, and a fraction."""
-        return np.where(self.seeps, 0.0, self.open_by(fluid) * beyond * fluid.density[self.at]), 0.0
+        return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,) by forces of inertia on the fluid, m^d/s."""
-        along = np.einsum("md,md->m", fluid.force[self.at], self.reach)
+        along = np.einsum("md,md->m", fluid.force[self.at], self.offset)
         return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
 
 
@@ -172,42 +172,42 @@ class UnsaturatedFaces(OpenFaces):
     """Faces on open sides of unsaturated soil; conductance: at k_r = 1.
 
     relative: conductivities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): outer
-    potentials less the weight of the fluid up to them, Pa; beyond (m,): outer pressures, Pa; fall (m,): that weight.
+    potentials less the weight of the fluid up to them, Pa; outside (m,): outer pressures, Pa; drop (m,): that weight.
     """
 
     relative: Relative
     cells: NDArray[np.int32]
     normal: NDArray[np.float64]
     outer: NDArray[np.float64]
-    beyond: NDArray[np.float64]
-    fall: NDArray[np.float64]
+    outside: NDArray[np.float64]
+    drop: NDArray[np.float64]
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,) if it were open in both directions, m^d/s."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
-    def aslant(
-        self, fluid: Fluid, beyond: NDArray[np.float64]
+    def nonorthogonal(
+        self, fluid: Fluid, correction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction: no flow, and a fraction of the two-point flux, in [-1, 1].
 
         Conductivities change by decades in a step, so the correction follows the flux; it is limited not to empty soil.
         """
-        drives = fluid.pi[self.at] - self.outer
-        share = np.divide(beyond, drives, out=np.zeros_like(beyond), where=drives != 0).clip(-1, 1)
+        difference = fluid.pi[self.at] - self.outer
+        share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
         return 0.0, np.where(self.seeps, 0.0, share)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,) per unit of the potential difference, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[0]
 
-    def rises(self, fluid: Fluid) -> NDArray[np.float64]:
+    def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow by the cell's pressure, >= 0, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k_r of the faces (m,) at the cells' pressures, and the derivatives of k_r times the difference."""
-        return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.beyond, self.fall)
+        return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
 @dataclass(frozen=True)
@@ -223,14 +223,18 @@ class RainedFaces(OpenFaces):
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
-        wet = self.pond.outflow(fluid)
-        return np.where(np.isnan(self.rain), wet, np.minimum(np.maximum(-self.rain, wet), self.dry.outflow(fluid)))
+        ponded = self.pond.outflow(fluid)
+        return np.where(
+            np.isnan(self.rain), ponded, np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
+        )
 
-    def aslant(
-        self, fluid: Fluid, beyond: NDArray[np.float64]
+    def nonorthogonal(
+        self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction; zero on faces with rain."""
-        return tuple(np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.aslant(fluid, beyond))
+        return tuple(
+            np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
+        )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,) by forces of inertia, m^d/s; zero on faces with rain."""
@@ -240,10 +244,10 @@ class RainedFaces(OpenFaces):
         """Return the outflow through each face (m,) per unit of the potential difference, m^d/(Pa s)."""
         return self.pond.open_by(fluid)
 
-    def rises(self, fluid: Fluid) -> NDArray[np.float64]:
+    def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow by the cell's pressure, m^d/(Pa s)."""
-        out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.rises(fluid), 0.0)
-        return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.rises(fluid))
+        out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
+        return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
 
 class SideFeeds(Feeds):
@@ -271,7 +275,7 @@ class SideFeeds(Feeds):
         self.settles = bool(self._seeps.any())
         self.linear = not any(self._rains)
         self._drain = wet.drains
-        self._flows, self._aslant = np.ones(len(sides.cells), dtype=bool), 0.0
+        self._flows, self._nonorthogonal = np.ones(len(sides.cells), dtype=bool), 0.0
         self._share: NDArray[np.float64] | float = 0.0
 
     def _pond(
@@ -286,15 +290,15 @@ class SideFeeds(Feeds):
         area = over_all(self._comm, sum_by(number, size, len(self._names)))
         most = depth * area
         full = np.divide(self._ponded, most, out=np.zeros(len(depth)), where=most > 0)
-        held = np.divide(self._ponded, area, out=np.zeros(len(depth)), where=area > 0)
+        depths = np.divide(self._ponded, area, out=np.zeros(len(depth)), where=area > 0)
         pressure = np.where(np.isnan(sides.rain), sides.pressure, full[number] * sides.pressure)
-        return replace(sides, pressure=pressure, rain=sides.rain + (held / dt)[number] * size), most
+        return replace(sides, pressure=pressure, rain=sides.rain + (depths / dt)[number] * size), most
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
         """Volumes of ponds at the start of the step, m^d, by number of the condition."""
-        held = self._before.get("ponded", {})
-        return np.array([float(held.get(name, 0.0)) for name in self._names])
+        volumes = self._before.get("ponded", {})
+        return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
     def conducting(self, flow: Conduction) -> OpenFaces:
         """Return the faces with their conductances."""
@@ -303,37 +307,37 @@ class SideFeeds(Feeds):
             return faces
         driest = np.where(np.isnan(self.sides.driest), self.sides.pressure, self.sides.driest)
         dry = self._faces(replace(self.sides, pressure=driest), flow)
-        same = (faces.at, faces.conductance, faces.inflow, faces.seeps, faces.reach)
+        same = (faces.at, faces.conductance, faces.inflow, faces.seeps, faces.offset)
         return RainedFaces(*same, self.sides.rain, faces, dry)
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
         """Return the faces for the outer pressures of `sides`."""
         at = self._contents.slot(sides.cells)
         conductance, inflow = sides.driven(at, flow)
-        reach = flow.deformed(at, sides.reach)
+        offset = flow.deformed(at, sides.offset)
         if flow.relative is None:
-            return OpenFaces(at, conductance, inflow, self._seeps, reach)
-        fall = np.zeros(len(at)) if flow.weight is None else reach @ flow.weight
-        where = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, fall
-        return UnsaturatedFaces(at, conductance, sides.given, self._seeps, reach, *where)
+            return OpenFaces(at, conductance, inflow, self._seeps, offset)
+        drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight
+        rest = flow.relative, sides.cells, sides.normal, sides.outer(at, flow), sides.pressure, drop
+        return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
-    def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
+    def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Open seepage faces with outflow; cell pressures decide, without the correction."""
         self._flows = at.outflow(fluid) >= 0
-        self._aslant, self._share = at.aslant(fluid, beyond)
+        self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
         """Return the outflow of the cells; the non-orthogonal correction is that of the start of the substep."""
-        through, counts = self._through(at, fluid), self._counts(at)
+        flux, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
-            through = through + at.driven(fluid)
-        rows = np.array([through, counts * at.open_by(fluid), np.abs(through) * self._drain])
+            flux = flux + at.driven(fluid)
+        rows = np.array([flux, counts * at.open_by(fluid), np.abs(flux) * self._drain])
         cells, turnover, gain = sum_by(at.at, rows, len(fluid.pi))
         return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # steady rain changes nothing: it has no gain
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow."""
-        return sum_by(at.at, self._counts(at) * (1 + self._share) * at.rises(fluid), len(fluid.pi))
+        return sum_by(at.at, self._counts(at) * (1 + self._share) * at.derivative(fluid), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
         """Open seepage faces with outflow and close the others; return the number of changes."""
@@ -351,8 +355,8 @@ class SideFeeds(Feeds):
         """Return the rain that does not infiltrate, m^d/s, by name of the rain."""
         if not any(self._rains):
             return {}
-        left = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
-        runs = over_all(self._comm, sum_by(self.sides.number, left, len(self._names)))
+        excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
+        runs = over_all(self._comm, sum_by(self.sides.number, excess, len(self._names)))
         runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # a pond feeds the soil as well
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
@@ -365,16 +369,16 @@ class SideFeeds(Feeds):
         return dict(zip(self._names, sums.T, strict=True))
 
     def volumes(
-        self, passed: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
+        self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return volumes of outflow through sides, of run-off, and of ponds, m^d."""
         if not any(self._rains):
             return {}
-        flowed, fell = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in passed])
+        flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])
         before = {quantity: self._before.get(quantity, {}) for quantity in ("flowed", "ran_off")}
-        held = self._ponded + fell + flowed
-        ponded = held.clip(0, self._most)
-        more = {"flowed": flowed, "ran_off": np.maximum(held - ponded, 0.0)}
+        available = self._ponded + rained + flowed
+        ponded = available.clip(0, self._most)
+        more = {"flowed": flowed, "ran_off": np.maximum(available - ponded, 0.0)}
         out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "flowed": {}, "ran_off": {}}
         for i, name in enumerate(self._names):
             for quantity in more if self._rains[i] else ("flowed",):
@@ -389,4 +393,4 @@ class SideFeeds(Feeds):
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
-        return np.where(self._counts(at), (1 + self._share) * at.outflow(fluid), 0.0) + self._aslant
+        return np.where(self._counts(at), (1 + self._share) * at.outflow(fluid), 0.0) + self._nonorthogonal

@@ -79,8 +79,8 @@ class Feeds:
     def conducting(self, flow: Conduction) -> Any:
         """Return data that depend on conductivities and motion of the cells; cached until these change."""
 
-    def begin(self, at: Any, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
-        """Begin a substep; beyond (m,), Pa: correction of the cell pressure at `sides`, see `nonorthogonal`."""
+    def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
+        """Begin a substep; difference (m,), Pa: correction of the cell pressure at `sides`, see `nonorthogonal`."""
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
         """Return the outflow of the cells."""
@@ -107,11 +107,11 @@ class Feeds:
         return {}
 
     def volumes(
-        self, passed: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
+        self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return volumes since the conditions began, m^d, by quantity and name, after a step.
 
-        passed, seconds: rates of its substeps, see `passing`, and their weights, s.
+        rates, seconds: rates of its substeps, see `passing`, and their weights, s.
         """
         return {}
 

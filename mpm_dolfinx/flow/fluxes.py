@@ -40,7 +40,7 @@ class Mobility:
     mean (n,): of the pieces, m^2/(Pa s); share (n, d): mobility along each axis over the mean; shift (n, d): vector, m,
     from the centroid to the position of the cell's pressure.  The last two are None without mixed cells.  In
     unsaturated soil mean and share refer to saturated pores.  shares (n, k): parts of the mean by soils without a
-    retention curve and by each retention curve; ways: of mixed cells, see `series`; borders: faces between cells of
+    retention curve and by each retention curve; paths: of mixed cells, see `series`; borders: faces between cells of
     different soil.
     """
 
@@ -48,7 +48,7 @@ class Mobility:
     share: NDArray[np.float64] | None = None
     shift: NDArray[np.float64] | None = None
     shares: NDArray[np.float64] | None = None
-    ways: Any = None
+    paths: Any = None
     borders: Any = None
 
 
@@ -75,7 +75,7 @@ class Conduction:
     relative: Any = None
 
     @cached_property
-    def _turned(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _cofactors(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Cofactors (n, d, d) and determinants (n,) of the cells' F."""
         return cofactor(self.motion.F), determinant(self.motion.F)
 
@@ -85,8 +85,8 @@ class Conduction:
         kappa = kappa.repeat(dim, axis=1) if share is None else kappa * share
         if self.motion is None:
             return kappa
-        (turned, ratio), hoop = self._turned, self.motion.hoop
-        along = kappa / ratio[:, None] * np.add.reduce(turned**2, axis=1)
+        (cofactors, ratio), hoop = self._cofactors, self.motion.hoop
+        along = kappa / ratio[:, None] * np.add.reduce(cofactors**2, axis=1)
         return along if hoop is None else along * hoop[:, None]
 
     def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -96,25 +96,25 @@ class Conduction:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
         if self.motion is None:
             return kappa
-        (turned, ratio), hoop = self._turned, self.motion.hoop
-        pulled = turned[at] @ normal[:, :, None]
+        (cofactors, ratio), hoop = self._cofactors, self.motion.hoop
+        pulled = cofactors[at] @ normal[:, :, None]
         across = kappa / ratio[at] * np.add.reduce(pulled**2, axis=(1, 2))
         return across if hoop is None else across * hoop[at]
 
-    def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
+    def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
         """Return ratios (m,) of distances to faces, along normals (m, d): from centroids over from pressure positions.
 
-        reach (m, d): vectors from the centroids to the faces, m.
+        offset (m, d): vectors from the centroids to the faces, m.
         """
         if self.mobility.shift is None:
             return 1.0
-        way = (reach * normal).sum(axis=1)
-        rest = way - (self.mobility.shift[at] * normal).sum(axis=1)
-        return np.divide(way, rest, out=np.ones(len(way)), where=rest > 0)
+        distance = (offset * normal).sum(axis=1)
+        shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
+        return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
 
-    def deformed(self, at: NDArray[np.int64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+    def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the deformed vectors (m, d), m, in cells `at`."""
-        return way if self.motion is None else (self.motion.F[at] @ way[:, :, None])[:, :, 0]
+        return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class OpenSides:
 
     number (m,): of the condition; cells (m,): owned cell behind each face; shape: area over distance to the cell's
     centroid, m^(d-2), zero for a prescribed inflow; pressure: outside, Pa; given: prescribed inflow, m^d/s; seeps:
-    outflow only; area (m, d): outward, m^(d-1); reach (m, d): vector from the cell's centroid, m; rain, driest (m,):
+    outflow only; area (m, d): outward, m^(d-1); offset (m, d): vector from the cell's centroid, m; rain, driest (m,):
     rain, m^d/s, and lowest outer pressure, Pa, nan without rain.
     """
 
@@ -134,7 +134,7 @@ class OpenSides:
     given: NDArray[np.float64]
     seeps: NDArray[np.bool_]
     area: NDArray[np.float64]
-    reach: NDArray[np.float64]
+    offset: NDArray[np.float64]
     rain: NDArray[np.float64]
     driest: NDArray[np.float64]
 
@@ -158,13 +158,13 @@ class OpenSides:
 
         The inflow is prescribed, or due to outer pressure and gravity; at (m,): index of the cells among filled ones.
         """
-        shape = self.shape * flow.nearer(at, self.normal, self.reach)
+        shape = self.shape * flow.distance_ratio(at, self.normal, self.offset)
         conductance = flow.across(at, self.normal) * shape
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
         """Return the outer mass potentials (m,), less the weight of the fluid up to the faces, Pa."""
-        outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.reach) @ flow.weight
+        outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -180,15 +180,15 @@ class OpenSides:
             Pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
-        distance = np.einsum("md,md->m", self.reach, self.normal)
+        distance = np.einsum("md,md->m", self.offset, self.normal)
         # prescribed inflows have no conductance; closed seepage faces have no pressure
         drained = ((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure))).nonzero()[0]
         at = at[drained]
         normal = self.normal[drained]
         distance = distance[drained]
         area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
-        looks = normal[:, :, None] * [-1, 1]
-        share = np.where(looks > ALONG, area[:, None, None] * looks, 0.0)
+        cosine = normal[:, :, None] * [-1, 1]
+        share = np.where(cosine > ALONG, area[:, None, None] * cosine, 0.0)
         ends = 2 * out.shape[1]
         slots = (ends * at[:, None] + np.arange(ends)).ravel()
 
@@ -379,7 +379,7 @@ class FluxForms:
         d0 = h0 / 2 - ufl.dot(self.centroid("+"), n0)
         d1 = h1 / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
-        apart = across * n0 - ufl.jump(self.centroid + self.moved)
+        offset = across * n0 - ufl.jump(self.centroid + self.moved)
         if inertial is not None:
             # mean over two cells like the mass, with a sixth of each neighbouring node.  With the value at the face,
             # freely flowing water would have more mass than all of the soil in modes that alternate between nodes
@@ -389,12 +389,12 @@ class FluxForms:
             else:
                 along = ufl.avg(inertial) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
-        fall = 0.0 if weight is None else ufl.dot(weight, apart)
+        drop = 0.0 if weight is None else ufl.dot(weight, offset)
         if relative is not None:
-            between = relative.between(pressure, fall)
+            between = relative.between(pressure, drop)
             k0, k1 = (k * relative.conducts(side, [one.k for one in between]) for k, side in ((k0, "+"), (k1, "-")))
-        resists = d0 * k1 + d1 * k0 + TINY
-        T = share * k0 * k1 / resists
+        resistance = d0 * k1 + d1 * k0 + TINY
+        T = share * k0 * k1 / resistance
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
         self.dt = fem.Constant(mesh, 0.0)
@@ -412,29 +412,31 @@ class FluxForms:
         self._sum = fem.Function(Q)
         off = ufl.jump(self.centroid)
         along = off - ufl.dot(off, n0) * n0
-        self.aslant = None
+        self.nonorthogonal = None
         if flows and not grid.axisymmetric:
-            carried = T * ufl.avg(self.density)
-            self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
+            conductance = T * ufl.avg(self.density)
+            self.nonorthogonal = FacetForm(
+                -conductance * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm
+            )
         self.gravity = None
         if (weight is not None or relative is not None) and flows:
             # water at rest stays at rest: its pressure grows by its weight at zero pressure.  Both are in one form, so
             # rounding errors are conservative, and those of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
-            drives = ufl.jump(pressure) + fall
-            driven = T * density * drives * ufl.jump(q) * dS
-            self.gravity = FacetForm(driven, grid.comm)
+            difference = ufl.jump(pressure) + drop
+            flux = T * density * difference * ufl.jump(q) * dS
+            self.gravity = FacetForm(flux, grid.comm)
             if relative is not None:
 
                 def by_k(k):
                     """Return the slope of T by k_r of a law, without squares of conductivities, which would vanish."""
                     return share * (
-                        d0 * (k1 / resists) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resists) ** 2 * ufl.diff(k1, k)
+                        d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )
 
                 # the outflow of a cell rises with its pressure, and falls with the neighbour's, also with rounding
                 own, other = (
-                    T * sign + drives * sum(by_k(one.k) * one.slopes[side] for one in between)
+                    T * sign + difference * sum(by_k(one.k) * one.slopes[side] for one in between)
                     for side, sign in enumerate((1, -1))
                 )
                 slope = ufl.max_value(own, 0.0) * dp("+") + ufl.min_value(other, 0.0) * dp("-")

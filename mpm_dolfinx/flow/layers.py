@@ -8,7 +8,7 @@ complete lines.
 
 The position of a cell's pressure is the point where steady flow along a line has its mean pressure.  The resistance to
 the lower end is int (1 - s) dR, to the upper end int s dR, s in [0, 1] along the line.  Their sum over faces is exact.
-For layers inclined by more than `ASLANT` the position moves to the more conductive end.  Otherwise a drain would be
+For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a drain would be
 interrupted between rows of cells.  The shape of a piece is approximated by its domain's bounding box in the cell.
 
 A conductivity that depends on deformation varies within a cell without layers: see `graded`.
@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.fluxes import CellContents, Mobility
-from mpm_dolfinx.flow.series import Ways, none
+from mpm_dolfinx.flow.series import Paths, none
 from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
-ASLANT = 0.01
+INCLINED = 0.01
 """Slope of layers above which a cell's pressure moves to its most conductive part.
 
 Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03.
@@ -70,14 +70,14 @@ class MixedCells:
         Their volumes (m,), m^d.
     contents
         Contents of the cells.
-    alike
+    soils
         Rows (m, k) that are equal for pieces of equal conductivity.
     """
 
-    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, alike):
+    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
         self._rows = rows
         self._x = x
-        self._kind = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
+        self._kind = np.unique(soils, axis=0, return_inverse=True)[1].ravel()
         self._volume = volume
         own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
         self._h = contents.grid.sizes(own)
@@ -85,15 +85,15 @@ class MixedCells:
         """The cells."""
         self._filled, self._middle = contents.slot(own), contents.centroid[own] / self._h
         middle = self._middle
-        self._room = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
+        self._bounds = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
         count, first = count[self._at], first[self._at]
         ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
-        met = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
+        crossings = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
         size, share = np.maximum(high - low, NEAR), volume / contents.grid.sizes(cells).prod(axis=-1)
         self._lines = []
-        for axis, found in enumerate(zip(*met, strict=True)):
-            line, piece, meets = (np.concatenate(rows) for rows in zip(*found, strict=True))
-            length = (share / np.delete(size, axis, axis=1).prod(axis=1))[piece] * meets
+        for axis, found in enumerate(zip(*crossings, strict=True)):
+            line, piece, fraction = (np.concatenate(rows) for rows in zip(*found, strict=True))
+            length = (share / np.delete(size, axis, axis=1).prod(axis=1))[piece] * fraction
             total, place = (sum_by(line, length * y, len(cells)) for y in (1.0, x[piece, axis]))
             before = 0.5 + ((place / total)[line] - x[piece, axis]) / total[line]
             self._lines.append(Lines(line, piece, length, before, total))
@@ -108,9 +108,9 @@ class MixedCells:
         inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / NEAR + 0.5
         out = []
         for axis in range(self._x.shape[1]):
-            meets = np.delete(inside, axis, axis=1).clip(0, 1).prod(axis=1)
-            kept = np.flatnonzero(meets)
-            out.append((line[kept], piece[kept], meets[kept]))
+            fraction = np.delete(inside, axis, axis=1).clip(0, 1).prod(axis=1)
+            kept = np.flatnonzero(fraction)
+            out.append((line[kept], piece[kept], fraction[kept]))
         return out
 
     def mobility(
@@ -131,7 +131,7 @@ class MixedCells:
         shift = np.zeros((len(mean), along.shape[1]))
         share = np.ones_like(shift) if share is None else share
         share[self._filled] = np.divide(along, mean[self._filled, None], out=np.zeros_like(along), where=along > 0)
-        shift[self._filled] = off.clip(*self._room) * self._h
+        shift[self._filled] = off.clip(*self._bounds) * self._h
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -146,11 +146,11 @@ class MixedCells:
         with np.errstate(divide="ignore"):
             resistivity = 1 / kappa
         for axis, lines in enumerate(self._lines):
-            resists = lines.length * resistivity[lines.piece]
-            resistance = sum_by(lines.line, resists, len(kappa))
+            resistances = lines.length * resistivity[lines.piece]
+            resistance = sum_by(lines.line, resistances, len(kappa))
             conducts = self._volume * lines.total / resistance
-            resists = np.where((resistance < np.inf)[lines.line], resists, 0.0)
-            below = sum_by(lines.line, resists * lines.before, len(kappa))
+            resistances = np.where((resistance < np.inf)[lines.line], resistances, 0.0)
+            below = sum_by(lines.line, resistances * lines.before, len(kappa))
             below = np.divide(below, resistance, out=np.full(len(kappa), 0.5), where=resistance < np.inf)
             off = lines.total * (sharper[self._at] * (below - 0.5)).clip(-0.5, 0.5)
             total = sum_by(self._at, conducts, n)
@@ -158,10 +158,10 @@ class MixedCells:
             np.divide(sum_by(self._at, conducts * off, n), total, out=shift[:, axis], where=total > 0)
         return mobility, shift
 
-    def ways(
+    def paths(
         self, kappa: NDArray[np.float64], law: NDArray[np.int64], laws: int, shift: NDArray[np.float64] | None
-    ) -> Ways:
-        """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Ways`.
+    ) -> Paths:
+        """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
         Parameters
         ----------
@@ -172,12 +172,12 @@ class MixedCells:
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
-        found = [self._way(axis, end, kappa, law, laws, place[:, axis]) for axis, end in np.ndindex(place.shape[1], 2)]
-        slots = max(1, *(way.law.shape[1] for way in found))
-        grown, shape = [way.with_slots(slots) for way in found], (*place.shape, 2)
-        return Ways(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in zip(*grown, strict=True)))
+        found = [self._path(axis, end, kappa, law, laws, place[:, axis]) for axis, end in np.ndindex(place.shape[1], 2)]
+        slots = max(1, *(path.law.shape[1] for path in found))
+        padded, shape = zip(*(path.with_slots(slots) for path in found), strict=True), (*place.shape, 2)
+        return Paths(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in padded))
 
-    def _way(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Ways:
+    def _path(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Paths:
         """Return the paths (n, ...) from positions (n,) in the cell along an axis to one of its ends."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
@@ -191,19 +191,19 @@ class MixedCells:
         weight = weight / np.maximum(sum_by(self._at, weight, n), TINY)[self._at]
         part = length / total[line]
         with np.errstate(divide="ignore"):
-            resists = part / kappa[piece]
+            resistances = part / kappa[piece]
         run = np.append(0, np.cumsum((np.diff(line) != 0) | (np.diff(self._kind[piece]) != 0)))
         start = np.searchsorted(line, line)
         run = run - run[start] if len(run) and len(line) else run[:0]
         several = np.zeros(len(kappa), dtype=bool)
         several[line[run > 0]] = True
         alone = ~several[line]
-        beside = np.zeros((n, laws))
+        parallel = np.zeros((n, laws))
         first = np.zeros(len(kappa), dtype=np.int64)
         first[line] = law[piece]
-        resistance = sum_by(line[alone], resists[alone], len(kappa))
-        lone = np.flatnonzero((total > 0) & ~several)
-        np.add.at(beside, (self._at[lone], first[lone]), weight[lone] / resistance[lone])
+        resistance = sum_by(line[alone], resistances[alone], len(kappa))
+        single = np.flatnonzero((total > 0) & ~several)
+        np.add.at(parallel, (self._at[single], first[single]), weight[single] / resistance[single])
         cell = self._at[line]
         share = sum_by(self._at, np.where(several, weight, 0.0), n)
         keys = np.stack([cell, run, self._kind[piece]], axis=1)[~alone]
@@ -215,8 +215,8 @@ class MixedCells:
         counts = weight[line[~alone]]
         out.law[of[slot], number[slot]] = law[piece[~alone]]
         np.add.at(out.length, (of[slot], number[slot]), counts * part[~alone] / share[of[slot]])
-        np.add.at(out.resistance, (of[slot], number[slot]), counts * resists[~alone] / share[of[slot]] ** 2)
-        return out._replace(beside=beside)
+        np.add.at(out.resistance, (of[slot], number[slot]), counts * resistances[~alone] / share[of[slot]] ** 2)
+        return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the additional factor (n,) of a cell's shift for inclined layers."""
@@ -231,8 +231,8 @@ class MixedCells:
         conducts -= (total(conducts) / volume)[self._at]
         moment = np.stack([total(conducts * x) for x in self._x.T], axis=1) ** 2
         whole = moment.sum(axis=1) ** 2
-        aslant = np.divide(whole - (moment**2).sum(axis=1), 2 * whole, out=np.zeros(n), where=whole > 0)
-        return aslant / ASLANT**2
+        inclined = np.divide(whole - (moment**2).sum(axis=1), 2 * whole, out=np.zeros(n), where=whole > 0)
+        return inclined / INCLINED**2
 
 
 def graded(
@@ -255,26 +255,27 @@ def graded(
     parts = []  # of the variance, by the linear change along each axis
     for x, least in zip(offset.T, (NEAR * contents.grid.sizes(contents.filled).T) ** 2, strict=True):
         middle, moment = contents.mean(x), contents.mean(x * kappa)
-        spread = contents.mean(x**2) - middle**2
-        parts.append(np.divide((moment - middle * mean) ** 2, spread, out=np.zeros(len(mean)), where=spread > least))
+        variance = contents.mean(x**2) - middle**2
+        square = (moment - middle * mean) ** 2
+        parts.append(np.divide(square, variance, out=np.zeros(len(mean)), where=variance > least))
     parts = np.stack(parts, axis=1)
     whole = parts.sum(axis=1, keepdims=True)
     along = np.divide(parts, whole, out=np.full(parts.shape, 1 / parts.shape[1]), where=whole > 0)
-    less = np.divide(mean - series, mean, out=np.zeros(len(mean)), where=mean > 0)
-    return 1 - less[:, None] * along
+    reduction = np.divide(mean - series, mean, out=np.zeros(len(mean)), where=mean > 0)
+    return 1 - reduction[:, None] * along
 
 
-def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
+def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
     """Return the owned cells with pieces of different conductivity, None if no process has any.
 
-    alike: (m, k) rows that are equal for pieces of equal conductivity.
+    soils: (m, k) rows that are equal for pieces of equal conductivity.
     """
     grid = cut.grid
     cells = cut.cells
     volume = contents.area
-    some = np.zeros((grid.num_local, alike.shape[1]))
-    some[cells] = alike  # of any of the cell's pieces
-    mixed = sum_by(cells, (alike != some[cells]).any(axis=1), grid.num_local) > 0
+    some = np.zeros((grid.num_local, soils.shape[1]))
+    some[cells] = soils  # of any of the cell's pieces
+    mixed = sum_by(cells, (soils != some[cells]).any(axis=1), grid.num_local) > 0
     corners = cut.points.corners
     low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))
     if over_all(grid.comm, bool(mixed.any())) == 0:
@@ -289,4 +290,4 @@ def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellConte
     else:
         half = 0.5 * (volume / grid.volumes(cells))[:, None] ** (1 / grid.dim)
         low, high = x - half, x + half
-    return MixedCells(rows, cells, low, high, x, volume, contents, alike[rows])
+    return MixedCells(rows, cells, low, high, x, volume, contents, soils[rows])

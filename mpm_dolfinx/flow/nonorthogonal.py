@@ -39,14 +39,14 @@ Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03.
 """
 
 
-def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the facets between two active cells with centroids that are not opposite each other."""
     grid = contents.grid
     first, other = grid.facet_cells[facets].T
-    apart = contents.centroid[other] - contents.centroid[first]
+    offset = contents.centroid[other] - contents.centroid[first]
     h = grid.sizes(first)
     across = np.abs(grid.midpoints[other] - grid.midpoints[first]) > 0.5 * h
-    return facets[(np.where(across, 0.0, np.abs(apart) / h) > ALONG).any(axis=1)]
+    return facets[(np.where(across, 0.0, np.abs(offset) / h) > ALONG).any(axis=1)]
 
 
 class Gradients:
@@ -67,33 +67,33 @@ class Gradients:
         share = contents.open
         towards = np.repeat(np.arange(d), 2)
         at, normal = contents.slot(sides.cells), sides.normal
-        foot = sides.reach - np.einsum("md,md->m", sides.reach, normal)[:, None] * normal
-        beside = grid.beside(contents.filled)
-        there = np.maximum(beside, 0)
-        inside = (beside >= 0) & (share[contents.filled] > 0)
+        tangential = sides.offset - np.einsum("md,md->m", sides.offset, normal)[:, None] * normal
+        neighbours = grid.neighbours(contents.filled)
+        cells = np.maximum(neighbours, 0)
+        inside = (neighbours >= 0) & (share[contents.filled] > 0)
         for axis, end in np.ndindex(d, 2):
-            inside[:, axis, end] &= share[there[:, axis, end], axis, 1 - end] > 0
-        there, inside = there.reshape(-1, 2 * d), inside.reshape(-1, 2 * d)
-        way = centroid[there] - centroid[contents.filled][:, None]
-        along = np.where(inside[:, :, None], way / 2, 0.0)
+            inside[:, axis, end] &= share[cells[:, axis, end], axis, 1 - end] > 0
+        cells, inside = cells.reshape(-1, 2 * d), inside.reshape(-1, 2 * d)
+        separation = centroid[cells] - centroid[contents.filled][:, None]
+        along = np.where(inside[:, :, None], separation / 2, 0.0)
         along[:, np.arange(2 * d), towards] = 0.0
         h = grid.sizes(contents.filled)
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
-        off[at[(np.abs(foot / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
+        off[at[(np.abs(tangential / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
         self.rows = rows = np.flatnonzero(off)
         """Indices of these cells among the filled ones."""
-        apart = h[towards] if grid.even else grid.between(contents.filled[:, None], there, towards)
-        way[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * apart
-        self._here = contents.filled[rows]
-        self._there = there[rows]
+        distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
+        separation[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * distance
+        self._own = contents.filled[rows]
+        self._neighbours = cells[rows]
         self._inside = inside[rows]
-        self._along, self._way = along[rows], way[rows]
+        self._along, self._separation = along[rows], separation[rows]
         place = np.full(len(off), -1)
         place[rows] = np.arange(len(rows))
         self._faces = np.flatnonzero(off[at])
         self._at = place[at[self._faces]]
-        self._reach = sides.reach[self._faces]
-        self._foot = foot[self._faces]
+        self._offset = sides.offset[self._faces]
+        self._tangential = tangential[self._faces]
         self._normal = normal[self._faces]
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
         size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
@@ -114,19 +114,19 @@ class Gradients:
         self, sealed: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the gradients for unit differences to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
-        known, d = self._known, self._way.shape[2]
+        known, d = self._known, self._separation.shape[2]
         at = self._at[known]
-        reach = self._reach[known]
-        near = np.broadcast_to((NEAREST * self._grid.sizes(self._here).min(axis=-1)) ** 2, len(self._here))
-        apart = np.maximum((self._way**2).sum(axis=2), near[:, None])
-        to_cells = self._inside[:, :, None] * self._way / apart[:, :, None]
-        distance = np.einsum("md,md->m", reach, self._normal[known])
-        to_sides = (weight / np.maximum(distance**2, near[at]))[:, None] * reach
+        offset = self._offset[known]
+        near = np.broadcast_to((NEAREST * self._grid.sizes(self._own).min(axis=-1)) ** 2, len(self._own))
+        squared = np.maximum((self._separation**2).sum(axis=2), near[:, None])
+        to_cells = self._inside[:, :, None] * self._separation / squared[:, :, None]
+        distance = np.einsum("md,md->m", offset, self._normal[known])
+        to_sides = (weight / np.maximum(distance**2, near[at]))[:, None] * offset
         size = np.linalg.norm(sealed, axis=1, keepdims=True)
         closed = np.divide(sealed, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
-        A = np.einsum("nki,nkj->nij", to_cells, self._way) + closed[:, :, None] * closed[:, None, :]
+        A = np.einsum("nki,nkj->nij", to_cells, self._separation) + closed[:, :, None] * closed[:, None, :]
         for i, j in np.ndindex(d, d):
-            A[:, i, j] += sum_by(at, to_sides[:, i] * reach[:, j], len(A))
+            A[:, i, j] += sum_by(at, to_sides[:, i] * offset[:, j], len(A))
         inverse = np.linalg.pinv(A, rcond=NEAR, hermitian=True)
         return np.einsum("nij,nkj->nki", inverse, to_cells), np.einsum("mij,mj->mi", inverse[at], to_sides)
 
@@ -144,11 +144,11 @@ class Gradients:
         weight : (d,), N/m^3
             Of the fluid, None without gravity.
         """
-        here, at = p[self._here], self._at[self._known]
-        to_cells = p[self._there] - here[:, None]
-        to_sides = outer[self._faces[self._known]] - here[at]
+        own, at = p[self._own], self._at[self._known]
+        to_cells = p[self._neighbours] - own[:, None]
+        to_sides = outer[self._faces[self._known]] - own[at]
         if weight is not None:
-            to_cells, to_sides = to_cells - self._way @ weight, to_sides - self._reach[self._known] @ weight
+            to_cells, to_sides = to_cells - self._separation @ weight, to_sides - self._offset[self._known] @ weight
         to_cells = np.where(self._inside, to_cells, 0.0)
         out = np.einsum("nk,nki->ni", to_cells, self._of_cells)
         for axis in range(out.shape[1]):
@@ -156,25 +156,25 @@ class Gradients:
         low, high = to_cells.min(axis=1, initial=0.0), to_cells.max(axis=1, initial=0.0)
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
-        rise = np.einsum("nd,nkd->nk", out, self._along)
+        increment = np.einsum("nd,nkd->nk", out, self._along)
         share, slack = np.ones(len(out)), NEAR * (high - low)  # tolerance for uniform pressures
-        for room, most in ((-low, -rise.min(axis=1)), (high, rise.max(axis=1))):
-            room = room + slack
-            share = np.minimum(share, np.divide(room, most, out=np.ones(len(out)), where=most > room))
+        for bound, most in ((-low, -increment.min(axis=1)), (high, increment.max(axis=1))):
+            bound = bound + slack
+            share = np.minimum(share, np.divide(bound, most, out=np.ones(len(out)), where=most > bound))
         return out * share[:, None]
 
     def through_sides(self, slope: NDArray[np.float64], count: int) -> NDArray[np.float64]:
         """Return the correction of the cell pressure at open faces (count,), Pa."""
         out = np.zeros(count)
-        out[self._faces] = np.einsum("md,md->m", self._foot, slope[self._at])
+        out[self._faces] = np.einsum("md,md->m", self._tangential, slope[self._at])
         return out
 
 
-class AslantFlow(NamedTuple):
+class NonorthogonalFlow(NamedTuple):
     """Non-orthogonal correction of the two-point fluxes.
 
-    forms, facets: over the faces of `off_facets`; gradients: of the cut; contents, sides: contents of the cells, open
-    sides; weight (d,), N/m^3: of the fluid, None without gravity.
+    forms, facets: over the faces of `nonorthogonal_facets`; gradients: of the cut; contents, sides: contents of the
+    cells, open sides; weight (d,), N/m^3: of the fluid, None without gravity.
     """
 
     forms: FluxForms
@@ -192,5 +192,5 @@ class AslantFlow(NamedTuple):
         slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active
         density = np.exp(p[active] / bulk)
-        leaves = self.forms.along(slope, filled[self.gradients.rows], self.facets, active, density)
-        return leaves[filled], self.gradients.through_sides(slope, len(self.sides.cells))
+        outflow = self.forms.along(slope, filled[self.gradients.rows], self.facets, active, density)
+        return outflow[filled], self.gradients.through_sides(slope, len(self.sides.cells))

@@ -44,22 +44,22 @@ def second_differences(
     """
     own = unknowns.owned
     number = unknowns.map.indices
-    beside = grid.beside(own)
-    active = (beside >= 0) & (number[beside] >= 0)
+    neighbours = grid.neighbours(own)
+    active = (neighbours >= 0) & (number[neighbours] >= 0)
     row, axis = np.nonzero(active.all(axis=2))
-    low, high = beside[row, axis].T
-    here = own[row]
+    low, high = neighbours[row, axis].T
+    middle = own[row]
     share = np.minimum(
-        np.minimum(opening[here, axis, 0], opening[low, axis, 1]),
-        np.minimum(opening[here, axis, 1], opening[high, axis, 0]),
+        np.minimum(opening[middle, axis, 0], opening[low, axis, 1]),
+        np.minimum(opening[middle, axis, 1], opening[high, axis, 0]),
     )
-    h = [grid.along(cells, axis) for cells in (low, here, high)]
+    h = [grid.along(cells, axis) for cells in (low, middle, high)]
     between = [h[1], h[1]] if grid.even else [(h[0] + h[1]) / 2, (h[1] + h[2]) / 2]
-    pairs = (low, here), (here, high)
-    apart = [way + centroid[b, axis] - centroid[a, axis] for way, (a, b) in zip(between, pairs, strict=True)]
-    steep = [h[1] / np.maximum(d, way / 2) for way, d in zip(between, apart, strict=True)]
+    pairs = (low, middle), (middle, high)
+    distances = [gap + centroid[b, axis] - centroid[a, axis] for gap, (a, b) in zip(between, pairs, strict=True)]
+    steep = [h[1] / np.maximum(d, gap / 2) for gap, d in zip(between, distances, strict=True)]
     values = np.sqrt(share * strength[row, axis] / 4)[:, None] * np.stack([steep[0], -sum(steep), steep[1]], axis=1)
-    columns = number[np.stack([low, here, high], axis=1)].astype(PETSc.IntType)
+    columns = number[np.stack([low, middle, high], axis=1)].astype(PETSc.IntType)
     starts = np.arange(0, 3 * len(row) + 1, 3, dtype=PETSc.IntType)
     size = ((len(row), None), (unknowns.size, None))
     D = PETSc.Mat().createAIJ(size, csr=(starts, columns.ravel(), values.ravel()), comm=unknowns.comm)

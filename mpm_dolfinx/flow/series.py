@@ -26,40 +26,40 @@ from mpm_dolfinx.pores.retention import FARTHEST
 MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
 
 
-class Ways(NamedTuple):
+class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
-    beside (l,): mobilities, m^2/(Pa s), of parallel lines with a single retention curve, weighted by their fraction of
-    all lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,), -1 for unused
-    entries; length (s,), fraction of the path; resistance (s,), length over mobility and fraction of lines, Pa s/m^2.
+    parallel (l,): mobilities, m^2/(Pa s), of lines with a single retention curve, weighted by their fraction of all
+    lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,), -1 for unused entries;
+    length (s,), fraction of the path; resistance (s,), length over mobility and fraction of lines, Pa s/m^2.
     """
 
-    beside: NDArray[np.float64]
+    parallel: NDArray[np.float64]
     law: NDArray[np.int64]
     length: NDArray[np.float64]
     resistance: NDArray[np.float64]
 
-    def at(self, *index) -> Ways:
+    def at(self, *index) -> Paths:
         """Return the paths at an index."""
-        return Ways(*(values[index] for values in self))
+        return Paths(*(values[index] for values in self))
 
-    def everywhere(self, dim: int) -> Ways:
+    def everywhere(self, dim: int) -> Paths:
         """Return paths (n, ...) repeated for both ends of all axes (n, d, 2, ...)."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
-        return Ways(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
+        return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
-    def with_slots(self, count: int) -> Ways:
+    def with_slots(self, count: int) -> Paths:
         """Return paths padded to `count` soils in series."""
         more = [(0, 0)] * (self.law.ndim - 1) + [(0, count - self.law.shape[-1])]
         law, length, resistance = (
             np.pad(values, more, constant_values=v) for values, v in zip(self[1:], (-1, 0, 0), strict=True)
         )
-        return Ways(self.beside, law, length, resistance)
+        return Paths(self.parallel, law, length, resistance)
 
-    def eased(self, factor: NDArray[np.float64]) -> Ways:
+    def eased(self, factor: NDArray[np.float64]) -> Paths:
         """Return paths (n, d, 2, ...) with mobilities times a factor (n, d) along the axes."""
         factor = factor[:, :, None, None]
-        return self._replace(beside=self.beside * factor, resistance=self.resistance / factor)
+        return self._replace(parallel=self.parallel * factor, resistance=self.resistance / factor)
 
 
 class Through(NamedTuple):
@@ -69,9 +69,9 @@ class Through(NamedTuple):
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def none(count: int, laws: int, slots: int) -> Ways:
+def none(count: int, laws: int, slots: int) -> Paths:
     """Return paths (count, ...) without conductance."""
-    return Ways(
+    return Paths(
         np.zeros((count, laws)),
         np.full((count, slots), -1),
         np.zeros((count, slots)),
@@ -87,7 +87,7 @@ class _Links(NamedTuple):
     high: NDArray[np.int64]
     law: NDArray[np.int64]
     conductance: NDArray[np.float64]
-    fall: NDArray[np.float64]
+    drop: NDArray[np.float64]
 
 
 class _Flows(NamedTuple):
@@ -103,9 +103,9 @@ class _Flows(NamedTuple):
 def through(
     laws: Laws,
     p: Sequence[NDArray[np.float64]],
-    ways: Sequence[Ways],
+    paths: Sequence[Paths],
     lengths: Sequence[NDArray[np.float64]],
-    falls: Sequence[NDArray[np.float64]],
+    drops: Sequence[NDArray[np.float64]],
 ) -> Through:
     """Return the conductances of faces between two pressures.
 
@@ -115,109 +115,109 @@ def through(
         Conductivities by the pressure.
     p
         Pressures on both sides (m,), Pa.
-    ways
+    paths
         Paths of one or two cells (m, ...), from their pressure positions to the face.
     lengths
         Lengths of these paths (m,), m.
-    falls
+    drops
         Pressure drop by the fluid's weight along each, from the first side to the second (m,), Pa.
     """
-    counts = [np.maximum((way.law >= 0).sum(axis=1), 1) for way in ways]
+    counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
     out = np.zeros((3, len(p[0])))
     for i, count in enumerate(kinds):
         rows = np.flatnonzero(kind.ravel() == i)
-        of = [[values[rows] for values in each] for each in (p, lengths, falls)]
-        out[:, rows] = _Chain(laws, [way.at(rows) for way in ways], count.tolist(), *of).solved()
+        of = [[values[rows] for values in each] for each in (p, lengths, drops)]
+        out[:, rows] = _Chain(laws, [path.at(rows) for path in paths], count.tolist(), *of).solved()
     return Through(out[0], (out[1], out[2]))
 
 
 class _Chain:
     """Faces with equal numbers of soils in series, and a node at each border."""
 
-    def __init__(self, laws: Laws, ways: Sequence[Ways], count: Sequence[int], p, lengths, falls):
+    def __init__(self, laws: Laws, paths: Sequence[Paths], count: Sequence[int], p, lengths, drops):
         self._laws, self._p = laws, p
         self._size, self._nodes = len(p[0]), sum(count) + 1
         self._counts = count
         faces = np.arange(self._size)
-        links, rest = [], [p[0]]
-        for side, way in enumerate(ways):
-            first, fall = len(rest) - 1, falls[side]
+        links, hydrostatic = [], [p[0]]
+        for side, path in enumerate(paths):
+            first, drop = len(hydrostatic) - 1, drops[side]
             for j in range(count[side]):
                 slot = count[side] - 1 - j if side else j  # the second way begins at its place
-                held = way.law[:, slot] >= 0
-                part = np.where(held, way.length[:, slot], 1.0) * fall
+                used = path.law[:, slot] >= 0
+                part = np.where(used, path.length[:, slot], 1.0) * drop
                 with np.errstate(divide="ignore"):
-                    conducts = np.where(held, 1 / (way.resistance[:, slot] * lengths[side]), 0.0)
+                    conductance = np.where(used, 1 / (path.resistance[:, slot] * lengths[side]), 0.0)
                 node = np.full(self._size, first + j)
-                links.append(_Links(faces, node, node + 1, np.maximum(way.law[:, slot], 0), conducts, part))
-                rest.append(rest[-1] + part)
-            face, law = np.nonzero(way.beside)
-            low, high = (np.full(len(face), node) for node in (first, len(rest) - 1))
-            links.append(_Links(face, low, high, law, way.beside[face, law] / lengths[side][face], fall[face]))
+                links.append(_Links(faces, node, node + 1, np.maximum(path.law[:, slot], 0), conductance, part))
+                hydrostatic.append(hydrostatic[-1] + part)
+            face, law = np.nonzero(path.parallel)
+            low, high = (np.full(len(face), node) for node in (first, len(hydrostatic) - 1))
+            links.append(_Links(face, low, high, law, path.parallel[face, law] / lengths[side][face], drop[face]))
         self._parts = np.cumsum([0, *(len(one.face) for one in links)])
         self._links = _Links(*(np.concatenate(parts) for parts in zip(*links, strict=True)))
-        self._rest = np.stack(rest, axis=1)
-        self._drives = self._rest[:, -1] - p[1]
+        self._hydrostatic = np.stack(hydrostatic, axis=1)
+        self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
         """Return conductances and slopes (3, m)."""
-        links, drives = self._links, self._drives[:, None]
+        links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
-        scale = np.full(self._rest.shape, np.inf)
+        scale = np.full(self._hydrostatic.shape, np.inf)
         for node in (links.low, links.high):
             np.minimum.at(scale, (links.face, node), self._laws.scales[links.law])
         scale = scale[:, inner]
-        low, high = np.sort([self._rest, self._rest - drives], axis=0)[:, :, inner]
+        low, high = np.sort([self._hydrostatic, self._hydrostatic - difference], axis=0)[:, :, inner]
         size = np.minimum(scale, np.abs(low) + np.abs(high))
         done = self._nodes == 2
-        most, went = np.full(scale.shape, FARTHEST), np.zeros(scale.shape)
-        p = self._rest - np.arange(self._nodes) / (self._nodes - 1) * drives
+        most, previous = np.full(scale.shape, FARTHEST), np.zeros(scale.shape)
+        p = self._hydrostatic - np.arange(self._nodes) / (self._nodes - 1) * difference
         p[:, -1] = self._p[1]
         for _ in range(MOST):
             flows = self._flows(p)
             if done:
                 return self._condensed(flows)
-            here = p[:, inner].copy()
-            step, met = self._step(flows)
+            old = p[:, inner].copy()
+            step, balanced = self._step(flows)
             if self._nodes == 3:
-                low, high = np.where(step > 0, here, low), np.where(step < 0, here, high)
-            there = np.clip(here + step, low, high)
-            y, to = np.arcsinh(here / scale), np.arcsinh(there / scale)
+                low, high = np.where(step > 0, old, low), np.where(step < 0, old, high)
+            new = np.clip(old + step, low, high)
+            y, to = np.arcsinh(old / scale), np.arcsinh(new / scale)
             # a step in the opposite direction is at most half of the step before
-            most = np.where(went * (to - y) < 0, np.abs(went) / 2, np.minimum(1.25 * most, FARTHEST))
+            most = np.where(previous * (to - y) < 0, np.abs(previous) / 2, np.minimum(1.25 * most, FARTHEST))
             far = (np.abs(to - y) > most) & (np.minimum(y, to) < 0)
-            went = np.where(far, np.clip(to - y, -most, most), to - y)
-            there = np.where(far, (scale * np.sinh(np.where(far, y + went, 0.0))).clip(low, high), there)
-            done = (met | (np.abs(there - here) <= SAME * (np.abs(here) + size))).all()
-            p[:, inner] = np.where(met, here, there)
+            previous = np.where(far, np.clip(to - y, -most, most), to - y)
+            new = np.where(far, (scale * np.sinh(np.where(far, y + previous, 0.0))).clip(low, high), new)
+            done = (balanced | (np.abs(new - old) <= SAME * (np.abs(old) + size))).all()
+            p[:, inner] = np.where(balanced, old, new)
         raise NotConverged("soils in series: no solution for the pressure at their border")
 
     def _flows(self, p: NDArray[np.float64]) -> _Flows:
         """Return the flows at pressures of the nodes (m, nodes), Pa."""
         links = self._links
         ends = p[links.face, links.low], p[links.face, links.high]
-        k, slopes = self._laws.between(links.law, ends, links.fall)
-        drives, c = ends[0] - ends[1] + links.fall, links.conductance
-        rounding = 4 * EPSILON * c * (k + EPSILON**2) * (np.abs(ends[0]) + np.abs(ends[1]) + np.abs(links.fall))
-        own, other = (np.maximum(k + sign * drives * slope, 0.0) for sign, slope in zip((1, -1), slopes, strict=True))
-        return _Flows(c * k, c * own, c * other, c * k * drives, rounding)
+        k, slopes = self._laws.between(links.law, ends, links.drop)
+        difference, c = ends[0] - ends[1] + links.drop, links.conductance
+        rounding = 4 * EPSILON * c * (k + EPSILON**2) * (np.abs(ends[0]) + np.abs(ends[1]) + np.abs(links.drop))
+        own, other = np.maximum([k + difference * slopes[0], k - difference * slopes[1]], 0.0)
+        return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values of the links in series (m, nodes - 1)."""
-        here = np.cumsum([0, *(count + 1 for count in self._counts)])
-        number = [i for first, count in zip(here, self._counts, strict=False) for i in range(first, first + count)]
+        starts = np.cumsum([0, *(count + 1 for count in self._counts)])
+        number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
 
     def _step(self, flows: _Flows) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return steps (m, nodes - 2) of Newton's method, and nodes with a continuous flux within rounding."""
-        links, shape = self._links, self._rest.shape
+        links, shape = self._links, self._hydrostatic.shape
 
         def at(node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.bincount(links.face * shape[1] + node, values, shape[0] * shape[1]).reshape(shape)[:, 1:-1]
 
         x = at(links.high, flows.flux) - at(links.low, flows.flux)
-        met = np.abs(x) <= at(links.high, flows.rounding) + at(links.low, flows.rounding)
+        balanced = np.abs(x) <= at(links.high, flows.rounding) + at(links.low, flows.rounding)
         diagonal = at(links.high, flows.other) + at(links.low, flows.own) + TINY
         own, other = (self._chain(values)[:, 1:-1] for values in (flows.own, flows.other))
         for i in range(x.shape[1] - 1):  # Thomas's algorithm
@@ -227,20 +227,20 @@ class _Chain:
         x[:, -1] /= diagonal[:, -1]
         for i in range(x.shape[1] - 1)[::-1]:
             x[:, i] = (x[:, i] + other[:, i] * x[:, i + 1]) / diagonal[:, i]
-        return x, met
+        return x, balanced
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
         """Return conductances and slopes (3, m) between the ends: soils in series, parallel to other lines."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
-            way = None
+            path = None
             for i in range(part, part + count):
-                way = _series(way, rows[:, self._parts[i] : self._parts[i + 1]])
+                path = _series(path, rows[:, self._parts[i] : self._parts[i + 1]])
             part += count + 1
-            beside = slice(self._parts[part - 1], self._parts[part])
-            face = self._links.face[beside]
-            out = _series(out, way + np.stack([np.bincount(face, row[beside], self._size) for row in rows]))
+            parallel = slice(self._parts[part - 1], self._parts[part])
+            face = self._links.face[parallel]
+            out = _series(out, path + np.stack([np.bincount(face, row[parallel], self._size) for row in rows]))
         return out
 
 

@@ -17,7 +17,7 @@ each other.  The sum over the cells is the fluid balance.  `fluid_content` defin
 
 Corners follow more than u, points change cells, and pressure jumps are damped (below).  The volumes of domains
 therefore drift from their fluid content.  Points carry this volume defect, `owed`.  The next steps correct fractions of
-it, `due`, at a constant rate over the step.
+it, `defect`, at a constant rate over the step.
 
 Q1 with DG0 violates the inf-sup condition for vanishing flow within a step: alternating pressures have no effect.  A
 stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with
@@ -45,7 +45,7 @@ from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
-from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
+from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
@@ -146,9 +146,9 @@ class StorageForms:
         self.drains = "drainage" in pieces.sizes
         """Whether pores drain as a free surface falls."""
         if self.drains:
-            drains, suction = pieces.drainage
-            stored += drains * (filled(p, suction) - filled(self.p_n, suction))
-        felt = 1.0
+            yielded, suction = pieces.drainage
+            stored += yielded * (filled(p, suction) - filled(self.p_n, suction))
+        coupling = 1.0
         self.retains = retentions is not None
         """Whether pores drain under suction."""
         if self.retains:
@@ -156,10 +156,10 @@ class StorageForms:
             denser = ufl.exp(-fem.Constant(self.grid.mesh, 1 / (2 * bulk)) * (p - self.p_n))
             drained = (full - before) * pieces.pores
             stored = full * stored + drained * denser
-            felt = ufl.diff(p * retentions.of("bishop", p, pieces), p)
-            self._capacity = CellSums([ufl.diff(drained, p), full * felt], pieces)
+            coupling = ufl.diff(p * retentions.of("bishop", p, pieces), p)
+            self._capacity = CellSums([ufl.diff(drained, p), full * coupling], pieces)
         self._change = PointForm(stored * q * pieces.dx, pieces)
-        by_u = [pieces.biot * felt * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
+        by_u = [pieces.biot * coupling * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
@@ -211,31 +211,31 @@ class Outflow:
     """Conductances of the active owned cells at present displacements.
 
     at: data of the feeds, see `Feeds.conducting`; total (n,): outflow per unit of the cell's potential to other cells,
-    m^d/(Pa s); mobility (n, d): along the axes, m^2/(Pa s); aslant: non-orthogonal correction, or None.
+    m^d/(Pa s); mobility (n, d): along the axes, m^2/(Pa s); nonorthogonal: non-orthogonal correction, or None.
     """
 
     at: Sequence[Any]
     total: NDArray[np.float64]
     mobility: NDArray[np.float64]
-    aslant: AslantFlow | None
+    nonorthogonal: NonorthogonalFlow | None
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Outflow rates of the owned cells, m^d/s, or with `taken` outflow volumes, m^d.
+    """Outflow rates of the owned cells, m^d/s, or with `integrated` outflow volumes, m^d.
 
-    cells: outflow less sources of each; lost: outflow from the bodies less sources; turnover: sum of inflow and
+    cells: outflow less sources of each; net: outflow from the bodies less sources; turnover: sum of inflow and
     outflow; gain: absolute value of sources.
     """
 
     cells: NDArray[np.float64]
-    lost: NDArray[np.float64]
+    net: NDArray[np.float64]
     turnover: NDArray[np.float64]
     gain: NDArray[np.float64]
 
-    def taken(self, seconds: float) -> Rates:
+    def integrated(self, seconds: float) -> Rates:
         """Return the outflow volumes in a time, s."""
-        return Rates(seconds * self.cells, seconds * self.lost, seconds * self.turnover, seconds * self.gain)
+        return Rates(seconds * self.cells, seconds * self.net, seconds * self.turnover, seconds * self.gain)
 
 
 class StorageSystem:
@@ -287,19 +287,19 @@ class StorageSystem:
     @property
     def gravity(self) -> FacetSum | None:
         """Fluxes by p and the fluid's weight between cells of equal soil, None without a weight."""
-        return self._alike(self._forms.fluxes.gravity)
+        return self._over_uniform(self._forms.fluxes.gravity)
 
-    def _alike(self, form: FacetForm | None) -> FacetSum | None:
+    def _over_uniform(self, form: FacetForm | None) -> FacetSum | None:
         """Return a form over the faces between cells of equal soil, see `Relative`."""
         relative = self._forms.fluxes.relative
-        return form and form.on(self._facets if relative is None else relative.alike(self._facets))
+        return form and form.on(self._facets if relative is None else relative.uniform(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return grid positions of this process's unknowns, and an empty list of fixed ones: see `multigrid_solver`."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
-    def lost(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
+    def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
         """Set the change of the residual by displacements u, m^d: of the content and, with slopes, of the fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
@@ -323,7 +323,7 @@ class StorageSystem:
         flow: Conduction,
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces; off: arguments of `AslantFlow`, or None."""
+        """Assemble the fluxes through inner faces; off: arguments of `NonorthogonalFlow`, or None."""
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
         if (relative := self._forms.fluxes.relative) is not None:
@@ -332,11 +332,11 @@ class StorageSystem:
             flow = replace(flow, relative=relative)
         self.assemble_fluxes()
         total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # also of a cell without faces
-        aslant = None
+        nonorthogonal = None
         if off is not None:
             facets, gradients, sides = off
-            aslant = AslantFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
-        return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
+            nonorthogonal = NonorthogonalFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
+        return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
         """Assemble the matrix of fluxes between cells, in unsaturated soil at p; force: see `StorageForms.driven`."""
@@ -344,7 +344,7 @@ class StorageSystem:
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
             borders = relative.set_pressures(self._forms.p.x.array, force)
-        if (flux := self._alike(self._forms.fluxes.flux)) is not None:
+        if (flux := self._over_uniform(self._forms.fluxes.flux)) is not None:
             flux.assemble_matrix(self.T)
         if borders is not None:
             borders.add_slopes(self.T, self.unknowns)
@@ -388,7 +388,7 @@ class StorageProblem:
         Outflow volumes by the rate of the substep before.
     softness : (m,)
         Softness of the pieces, see `SoftnessAtPoints`, if the soil may soften.
-    due : (n,), m^d
+    defect : (n,), m^d
         Correction of the volume defect in the active owned cells until the end of the substep.
     inertial
         Function that returns the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
@@ -409,7 +409,7 @@ class StorageProblem:
         dt: float,
         before: Rates | None = None,
         softness: NDArray[np.float64] | float = 1.0,
-        due: NDArray[np.float64] | float = 0.0,
+        defect: NDArray[np.float64] | float = 0.0,
         inertial: Callable[[], NDArray[np.float64]] | None = None,
         scale: NDArray[np.float64] | None = None,
     ):
@@ -417,7 +417,7 @@ class StorageProblem:
         self.forms, self._p = forms, (forms.p.x.array, forms.p_n.x.array)
         self.system = system
         self.data = data
-        self._due = due
+        self._defect = defect
         self._inertial = inertial
         self._contents = contents
         self._feeds = feeds
@@ -425,18 +425,18 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
-        reach = 4 * forms.grid.most**2  # no two centroids are further apart than 2 h
+        squared = 4 * forms.grid.most**2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
         if forms.retains:  # dry pores hardly couple the two balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
             tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.ones(1)
-        known = [(tau * reach > least).any(), (softest * tau * reach > least).any() and softest.max() > 1]
+        known = [(tau * squared > least).any(), (softest * tau * squared > least).any() and softest.max() > 1]
         somewhere = over_all(forms.grid.comm, np.array([*known, any(one.settles for one in feeds)], dtype=float)) > 0
         self.damped, flows, self._settles = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
-        self._aslant = self._begin(outflow)
+        self._correction = self._begin(outflow)
         """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s, not in the tangent."""
         if self.damped:
             forms.fluxes.dt.value = dt
@@ -481,9 +481,9 @@ class StorageProblem:
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
-    def volumes(self, passed: Sequence[Sequence[Mapping]], seconds: Sequence[float]) -> dict[str, dict]:
+    def volumes(self, rates: Sequence[Sequence[Mapping]], seconds: Sequence[float]) -> dict[str, dict]:
         """Return volumes since the conditions began, see `Feeds.volumes`."""
-        found = [one.volumes(of, seconds) for one, of in zip(self._feeds, zip(*passed, strict=True), strict=True)]
+        found = [one.volumes(of, seconds) for one, of in zip(self._feeds, zip(*rates, strict=True), strict=True)]
         out: dict[str, dict] = {}
         for quantity, of in (pair for one in found for pair in one.items()):
             out[quantity] = out.get(quantity, {}) | of
@@ -500,9 +500,9 @@ class StorageProblem:
         """Volume fraction of material in the cells, the weight of their pressures."""
         return self._contents.fill
 
-    def sealed(self, lost: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the undrained pressure rise of the cells at fixed stress, Pa, for the volumes that they lost, m^d."""
-        return lost / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
+        return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return errors of the water content by pressure errors (n,), Pa, and its change in the step (n,)."""
@@ -521,10 +521,10 @@ class StorageProblem:
         """Start the substep of all feeds; return the non-orthogonal correction of fluxes between cells, m^d/s."""
         p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
-        between, beyond = 0.0, np.zeros(sum(sides))
-        if outflow.aslant is not None:
-            between, beyond = outflow.aslant(p, self.forms.bulk)
-        parts = np.split(beyond, np.cumsum(sides)[:-1])
+        between, difference = 0.0, np.zeros(sum(sides))
+        if outflow.nonorthogonal is not None:
+            between, difference = outflow.nonorthogonal(p, self.forms.bulk)
+        parts = np.split(difference, np.cumsum(sides)[:-1])
         for one, at, part in zip(self._feeds, outflow.at, parts, strict=False):
             one.begin(at, fluid, part)
         return between
@@ -535,14 +535,14 @@ class StorageProblem:
         return SAME if self.forms.retains else 1.0
 
     def restrained(
-        self, dp: NDArray[np.float64], went: NDArray[np.float64] | float
+        self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
         """Return limited pressure decreases, Pa, and changes of the suction's logarithm (n,).
 
-        dp (n,): decreases by Newton's method, Pa; went (n,): change of the logarithm in the iteration before.
+        dp (n,): decreases by Newton's method, Pa; previous (n,): change of the logarithm in the iteration before.
         """
         p = self._p[0][self.system.unknowns.owned]
-        dp = restrained(p, dp, self._scale, went)
+        dp = restrained(p, dp, self._scale, previous)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
@@ -566,17 +566,17 @@ class StorageProblem:
         of the fluxes.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
         """
         h = self.forms.grid.least
-        here, density = self._rates(self._flow(False)).cells, self._density
+        base, density = self._rates(self._flow(False)).cells, self._density
 
         def along(v: PETSc.Vec) -> NDArray[np.float64]:
             largest = v.norm(PETSc.NormType.NORM_INFINITY)
             if not 0 < largest < np.inf:
-                return np.zeros(len(here))
+                return np.zeros(len(base))
             step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array[dofs]
             unknowns.add(u, step, v)
-            there = self._rates(self._flow(False)).cells
+            moved = self._rates(self._flow(False)).cells
             u.x.array[dofs] = now
-            return self.dt * (there - here) / step / density
+            return self.dt * (moved - base) / step / density
 
         return along
 
@@ -589,7 +589,7 @@ class StorageProblem:
         b = forms.change(self.data)
         owned = system.unknowns.owned
         density = self._density
-        b[owned] = change = density * b[owned] + self._due
+        b[owned] = change = density * b[owned] + self._defect
         r = system.unknowns.gather(b, system.residual)
         step = system.step
         step.array_w[:] = self._p[0][owned] - self._p[1][owned]
@@ -598,12 +598,12 @@ class StorageProblem:
         if self._softer is not None:
             self._softer.multAdd(step, r, r)
         rates = self._rates(outflow)
-        now = rates.taken(self.dt)
+        now = rates.integrated(self.dt)
         mass = r.array_r + now.cells + before.cells
         r.array_w[:] = mass / density
         # bound of rounding errors: of volumes, and of fluxes that cancel
         round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
-        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
+        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.net + before.net
         return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
@@ -614,18 +614,17 @@ class StorageProblem:
             fluid = fluid._replace(force=self._inertial())
             force = self._local(fluid.force)
         if system.gravity is None:
-            cells = system.between(fluid.pi) + self._aslant
+            cells = system.between(fluid.pi)
         else:
-            cells = (
-                self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned] + self._aslant
-            )
-        lost, gain = np.zeros((2, len(cells)))
+            cells = self.forms.driven(system.gravity, self._contents.active, force)[system.unknowns.owned]
+        cells = cells + self._correction
+        net, gain = np.zeros((2, len(cells)))
         turnover = np.abs(outflow.total * fluid.pi)
         for one, at in zip(self._feeds, outflow.at, strict=True):
             leaving = one.leaving(at, fluid)
-            lost, gain = lost + leaving.cells, gain + leaving.gain
+            net, gain = net + leaving.cells, gain + leaving.gain
             turnover = turnover + leaving.turnover
-        return Rates(cells + lost, lost, turnover, gain)
+        return Rates(cells + net, net, turnover, gain)
 
     def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values (n, d) of the active owned cells in an array (c, d) of the local ones."""
@@ -633,12 +632,12 @@ class StorageProblem:
         out[self.system.unknowns.owned] = values
         return out
 
-    def came(self, rates: Rates) -> NDArray[np.float64]:
+    def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
         """Return the net inflow (n,), m^d, of the filled owned cells in the step by fluxes and sources.
 
         Volumes refer to the mid-step density, as in `change`.  rates: at the end of the substep.
         """
-        return (-rates.taken(self.dt).cells - self._before.cells) / self._density
+        return (-rates.integrated(self.dt).cells - self._before.cells) / self._density
 
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()

@@ -45,7 +45,7 @@ class Between(NamedTuple):
     slopes: tuple[Any, Any]
 
 
-def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) -> Between:
+def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
     """Return k_r between the two sides of a face.
 
     With the mean k of k_r over the pressures, the jump x of k_r over k, y = x fall / jump of the pressure, and
@@ -59,7 +59,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) 
         Pressures on both sides, Pa.
     tables
         Of both sides: integral of k_r, Pa, k_r, its slope, 1/Pa, see `retention.Conductance`.
-    fall
+    drop
         Pressure drop by the fluid's weight from the first side to the second, Pa.
     scale
         Characteristic suction of k_r, Pa.
@@ -69,20 +69,20 @@ def fitted(p: Sequence, tables: Sequence[Sequence], fall, scale, of: Functions) 
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
     close = of.less(abs(jump), CENTRAL * (abs(p[0]) + abs(p[1]) + scale))
-    apart = of.where(close, 1.0, jump)
-    mean = of.largest(of.where(close, (k0 + k1) / 2, (phi0 - phi1) / apart), 0.0)
-    rise0, rise1 = of.where(close, d0 / 2, (k0 - mean) / apart), of.where(close, d1 / 2, (mean - k1) / apart)
+    divisor = of.where(close, 1.0, jump)
+    mean = of.largest(of.where(close, (k0 + k1) / 2, (phi0 - phi1) / divisor), 0.0)
+    rise0, rise1 = of.where(close, d0 / 2, (k0 - mean) / divisor), of.where(close, d1 / 2, (mean - k1) / divisor)
     least = of.largest(mean, EPSILON * (abs(k0) + abs(k1)) + TINY)
     x = (k0 - k1) / least
     x0, x1 = (d0 - x * rise0) / least, -(d1 + x * rise1) / least
-    rate = of.where(close, (d0 + d1) / of.largest(k0 + k1, EPSILON * scale * abs(d0 + d1) + TINY), x / apart)
-    y = rate * fall
-    y0, y1 = (of.where(close, 0.0, fall * (slope - sign * rate) / apart) for slope, sign in ((x0, 1), (x1, -1)))
+    rate = of.where(close, (d0 + d1) / of.largest(k0 + k1, EPSILON * scale * abs(d0 + d1) + TINY), x / divisor)
+    y = rate * drop
+    y0, y1 = (of.where(close, 0.0, drop * (slope - sign * rate) / divisor) for slope, sign in ((x0, 1), (x1, -1)))
     (both, by_both), (one, by_one), (other, by_other) = (_log_sinhc(z, of) for z in (x + y, x, y))
     factor = of.exp(both - one - other)
     k = factor * mean
-    turns = ((rise0, x0, y0), (rise1, x1, y1))
-    slopes = (factor * rise + k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for rise, dx, dy in turns)
+    sides = ((rise0, x0, y0), (rise1, x1, y1))
+    slopes = (factor * slope_k + k * ((by_both - by_one) * dx + (by_both - by_other) * dy) for slope_k, dx, dy in sides)
     return Between(k, tuple(slopes))
 
 
@@ -104,7 +104,7 @@ class Laws:
         """Characteristic suctions, Pa."""
 
     def between(
-        self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], fall: NDArray[np.float64]
+        self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], drop: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k_r (m,) of laws (m,) between pressures on both sides (m,), Pa, and slopes (2, m): see `fitted`."""
         k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
@@ -112,7 +112,7 @@ class Laws:
             rows = np.flatnonzero(law == number)
             if len(rows):
                 ends = [side[rows] for side in p]
-                found = fitted(ends, [one(side).T for side in ends], fall[rows], one.scale, NUMPY)
+                found = fitted(ends, [one(side).T for side in ends], drop[rows], one.scale, NUMPY)
                 k[rows], slopes[:, rows] = found.k, found.slopes
         return k, slopes
 
@@ -142,13 +142,13 @@ class Relative:
         self._borders: Latest[Any] = Latest()
         self._flows: Latest[Any] = Latest()
 
-    def between(self, pressure: fem.Function, fall) -> list[Between]:
+    def between(self, pressure: fem.Function, drop) -> list[Between]:
         """Return k_r of each law between the two sides of a face as UFL variables: see `fitted`."""
         out = []
         for i, law in enumerate(self._laws.conductances):
             tables = [[self._tables(side)[3 * i + j] for j in range(3)] for side in "+-"]
             scale = fem.Constant(self._grid.mesh, law.scale)
-            found = fitted([pressure(side) for side in "+-"], tables, fall, scale, UFL)
+            found = fitted([pressure(side) for side in "+-"], tables, drop, scale, UFL)
             out.append(found._replace(k=ufl.variable(found.k)))
         return out
 
@@ -168,10 +168,10 @@ class Relative:
         pair = p[faces.pair]
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
-    def alike(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+    def uniform(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the faces between active cells of equal soil."""
         faces = self._borders.value
-        return facets if faces is None else faces.borders.alike
+        return facets if faces is None else faces.borders.uniform
 
     def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return k_r (m,) of owned cells at pressures (m,), Pa."""
@@ -184,24 +184,24 @@ class Relative:
         normal: NDArray[np.float64],
         p: NDArray[np.float64],
         outer: NDArray[np.float64],
-        fall: NDArray[np.float64],
+        drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k_r (m,) of owned cells along normals (m, d) between their pressures and others (m,), Pa.
 
-        Also return the derivative of k_r times the potential difference by their pressures.  fall (m,), Pa: pressure
+        Also return the derivative of k_r times the potential difference by their pressures.  drop (m,), Pa: pressure
         drop by the fluid's weight out of the cells.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, rises = shares[:, 0].copy(), shares[:, 0].copy()
+        k, derivative = shares[:, 0].copy(), shares[:, 0].copy()
         for law, share in zip(self._laws.conductances, shares.T[1:], strict=True):
-            between = fitted((p, outer), (law(p).T, law(outer).T), fall, law.scale, NUMPY)
+            between = fitted((p, outer), (law(p).T, law(outer).T), drop, law.scale, NUMPY)
             k += share * between.k
-            rises += share * (between.k + between.slopes[0] * (p - outer + fall))
+            derivative += share * (between.k + between.slopes[0] * (p - outer + drop))
         if (faces := self._borders.value) is not None:
-            found = faces.borders.through_sides(self._laws, faces.mobility, cells, normal, p, outer, fall)
+            found = faces.borders.through_sides(self._laws, faces.mobility, cells, normal, p, outer, drop)
             for rows, *of_borders in found:
-                k[rows], rises[rows] = of_borders
-        return k, np.maximum(rises, 0.0)
+                k[rows], derivative[rows] = of_borders
+        return k, np.maximum(derivative, 0.0)
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
         """Set the shares (n, count) of the filled owned cells."""

@@ -563,7 +563,7 @@ class Grid:
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
 
-    def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+    def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if this process has none."""
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)

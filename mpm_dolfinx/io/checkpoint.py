@@ -75,10 +75,10 @@ class Checkpoint:
     def __call__(self, simulation: Simulation) -> None:
         """Save the state if a checkpoint is due."""
         result, comm = simulation.result, simulation.grid.comm
-        due = (len(result.rows) - 1) % self.every == 0
-        if due and self.seconds > 0:
-            due = comm.bcast(time.monotonic() - self._written >= self.seconds)
-        if due or result.converged:
+        writes = (len(result.rows) - 1) % self.every == 0
+        if writes and self.seconds > 0:
+            writes = comm.bcast(time.monotonic() - self._written >= self.seconds)
+        if writes or result.converged:
             save(simulation, Path(self.file))
             self._written = time.monotonic()
 
@@ -86,7 +86,7 @@ class Checkpoint:
 def save(simulation: Simulation, file: Path) -> None:
     """Write the state of a simulation between two steps of a run."""
     comm = simulation.grid.comm
-    began = time.perf_counter()
+    start = time.perf_counter()
     state = simulation.state
     whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
     nodal = {}
@@ -104,7 +104,7 @@ def save(simulation: Simulation, file: Path) -> None:
 
     with on_disk(f"{file}: checkpoint at t = {state.t:g} s", WRITABLE):
         size = at_root(comm, write)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", state.t, file, size / 1e6, seconds)
 
 
@@ -184,10 +184,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         pieces = None
         of_stay = _part(arrays, "stay/")
         if of_stay:
-            keeps = of_stay.pop("keeps", None)
-            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids, total), keeps)
-            if keeps is not None and (keeps.dtype != bool or keeps.shape != points.id.shape):
-                raise ValueError(f"stay/keeps: {keeps.dtype} of shape {keeps.shape}")
+            in_cut = of_stay.pop("keeps", None)
+            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids, total), in_cut)
+            if in_cut is not None and (in_cut.dtype != bool or in_cut.shape != points.id.shape):
+                raise ValueError(f"stay/keeps: {in_cut.dtype} of shape {in_cut.shape}")
         if wet:
             own = _part(arrays, "pieces/")
             _check_pieces(own, points.id, dim)
@@ -406,9 +406,9 @@ def describe(simulation: Simulation) -> dict[str, Any]:
     return {**simulation.scene.description, **more}
 
 
-def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
+def _check_scene(file: Path, stored: dict[str, Any], present: dict[str, Any]) -> None:
     """Raise ValueError for the checkpoint of another scene."""
-    for name in {**there, **here}:
-        if there.get(name) != here.get(name):
-            both = f"{there.get(name)} there, {here.get(name)} here, must agree"
+    for name in {**stored, **present}:
+        if stored.get(name) != present.get(name):
+            both = f"{stored.get(name)} there, {present.get(name)} here, must agree"
             raise ValueError(f"{file}: checkpoint of another scene: {name}: {both}")

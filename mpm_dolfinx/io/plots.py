@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import flag, instance, line
 from mpm_dolfinx.io.units import unit
-from mpm_dolfinx.io.writer import VTK_CELLS, asked_of_points
+from mpm_dolfinx.io.writer import VTK_CELLS, fields_of_points
 from mpm_dolfinx.parallel.exchange import to_root
 from mpm_dolfinx.simulation.simulation import Simulation
 
@@ -76,9 +76,9 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
 
 def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     """Return the values (n,) of a field at the points of this process."""
-    points, asked = simulation.points, {}
+    points, fields = simulation.points, {}
     if str(field).startswith(("porosity", "saturation", "effective_", "stress", "mean_", "deviatoric_")):
-        asked = asked_of_points(simulation)  # collective
+        fields = fields_of_points(simulation)  # collective
     known: dict[str, Callable[[], Any]] = {
         "displacement": lambda: np.linalg.norm(points.displacement, axis=1),
         "displacement_x": lambda: points.displacement[:, 0],
@@ -87,10 +87,10 @@ def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     }
     if simulation.scene.fluid is not None:
         known["pressure"] = lambda: points.pressure
-    known |= {name: lambda rows=rows: rows for name, rows in {**points.data, **asked}.items() if rows.ndim == 1}
+    known |= {name: lambda rows=rows: rows for name, rows in {**points.data, **fields}.items() if rows.ndim == 1}
     if simulation.scene.fluid is None:  # the effective stress is the stress
         known |= {name.removeprefix("effective_"): known[name] for name in known if name.startswith("effective_")}
     if field not in known:
-        names = ", ".join({**known, **(asked or asked_of_points(simulation))})
+        names = ", ".join({**known, **(fields or fields_of_points(simulation))})
         raise ValueError(f"plot: field = {line(field)}, must be one of {names}")
     return np.asarray(known[field](), dtype=np.float64)

@@ -141,8 +141,8 @@ class Writer:
 
     def _start(self, result: Result) -> None:
         """Drop the output of later times from the folder: a new run continues it from here."""
-        if (began := result.rows[-2][0]) != self._t:
-            raise ValueError(f"writer: made at t = {self._t:g} s for a run that starts at t = {began:g} s")
+        if (start := result.rows[-2][0]) != self._t:
+            raise ValueError(f"writer: made at t = {self._t:g} s for a run that starts at t = {start:g} s")
         self._table.start(_row(Result(result.rows[-2:-1])))
         self._write_indices()
 
@@ -153,7 +153,7 @@ class Writer:
     def _write_points(self, simulation: Simulation) -> None:
         comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
         points, wet = simulation.points, simulation.scene.fluid is not None
-        points = replace(points, data={**points.data, **asked_of_points(simulation)})
+        points = replace(points, data={**points.data, **fields_of_points(simulation)})
         points = points.migrated(to_root(comm, len(points)))
 
         def write() -> None:
@@ -181,15 +181,15 @@ class Writer:
         self._grid.entries.append((simulation.t, pieces))
 
 
-def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
+def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
     """Return porosity, saturation, components and invariants of stresses (n,) at this process, by name."""
-    asked, wet = simulation.point_fields(), simulation.scene.fluid is not None
+    fields, wet = simulation.point_fields(), simulation.scene.fluid is not None
     drains = simulation.scene.materials.retentions is not None
-    out = {name: getattr(asked, name) for name in ("porosity", "saturation")[: 1 + drains]}
+    out = {name: getattr(fields, name) for name in ("porosity", "saturation")[: 1 + drains]}
     for name in ("effective_stress", "stress")[: 1 + wet]:
-        of = components(getattr(asked, name), simulation.grid.dim)
+        of = components(getattr(fields, name), simulation.grid.dim)
         out |= {f"{name}_{each}": values for each, values in of.items()}
-    return out | {name: getattr(asked, name) for name in ("mean_effective_stress", "deviatoric_stress")}
+    return out | {name: getattr(fields, name) for name in ("mean_effective_stress", "deviatoric_stress")}
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
@@ -441,9 +441,9 @@ class Table:
         at_root(self.comm, write)
 
     def _check(self, row: dict[str, float]) -> None:
-        here, there = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
-        if here != there:
-            both = f"{', '.join(there)}, the run's {', '.join(here)}"
+        row_names, known = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
+        if row_names != known:
+            both = f"{', '.join(known)}, the run's {', '.join(row_names)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
     def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:

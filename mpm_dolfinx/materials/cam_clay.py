@@ -190,9 +190,9 @@ class ModifiedCamClay(Skeleton):
         ratio = ufl.exp(-to.flow)
         volume = strain.volumetric + kappa * a
         b = strain.isotropic(lambda e: ufl.exp(2 * volume / 3 + ratio * (ufl.ln(e) - 2 * strain.volumetric / 3)))
-        back = ufl.inv(strain.F)
+        inverse = ufl.inv(strain.F)
         return {
-            "plastic": ufl.conditional(to.yields, back * b * back.T, plastic),
+            "plastic": ufl.conditional(to.yields, inverse * b * inverse.T, plastic),
             "consolidated": consolidated + ufl.conditional(to.yields, to.rho * a, 0.0),
         }
 
@@ -203,7 +203,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 def _dried(function: Callable) -> Callable:
     """Return a function of Modified Cam Clay under suction, with lambda(s) and P_c(s)."""
-    taken = Skeleton.taken_by(function)
+    arguments = Skeleton.arguments_of(function)
 
     def of(**given):
         wet, kappa, consolidated = (given[name] for name in ("lambda_", "kappa", "consolidated"))
@@ -215,16 +215,16 @@ def _dried(function: Callable) -> Callable:
             return (wet - kappa) / (slope(s) - kappa)
 
         start = ufl.ln(given["yield_pressure"] / given["reference"])
-        begun = ufl.conditional(ufl.gt(start, 0), start / power(given["suction_at_start"]), start)
-        size = begun + consolidated  # ln(P_c0 / P_r)
+        initial = ufl.conditional(ufl.gt(start, 0), start / power(given["suction_at_start"]), start)
+        size = initial + consolidated  # ln(P_c0 / P_r)
         s = ufl.conditional(ufl.gt(size, 0), given["trial"]["suction"], 0.0)
-        dried = consolidated + (power(s) - 1) * size + (begun - start)  # ln of P_c over that at the start
-        out = function(**({name: given[name] for name in taken} | {"lambda_": slope(s), "consolidated": dried}))
+        dried = consolidated + (power(s) - 1) * size + (initial - start)  # ln of P_c over that at the start
+        out = function(**({name: given[name] for name in arguments} | {"lambda_": slope(s), "consolidated": dried}))
         if function is ModifiedCamClay.update:
             out["consolidated"] = consolidated + (out["consolidated"] - dried) / power(s)
         return out
 
-    of.__signature__ = Signature([Parameter(name, Parameter.KEYWORD_ONLY) for name in (*taken, *DRIED[1:], *LC)])
+    of.__signature__ = Signature([Parameter(name, Parameter.KEYWORD_ONLY) for name in (*arguments, *DRIED[1:], *LC)])
     of.__qualname__ = function.__qualname__
     return of
 

@@ -124,8 +124,8 @@ def metric(trial: Trial, to: dict, bulk, plastic):
     # b = exp(2 eps) with the elastic strain eps = p/(3K) I + ratio dev(trial eps)
     mean, ratio = 2 * to["p"] / (3 * bulk), to["ratio"]
     b = trial.isotropic(lambda e: ufl.exp(mean + ratio * (ufl.ln(e) - 2 * trial.volumetric / 3)))
-    back = ufl.inv(trial.F)
-    return ufl.conditional(to["yields"], back * b * back.T, plastic)
+    inverse = ufl.inv(trial.F)
+    return ufl.conditional(to["yields"], inverse * b * inverse.T, plastic)
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:

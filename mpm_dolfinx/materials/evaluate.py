@@ -97,9 +97,9 @@ class LawAtPoints:
         """Return some of the material points, with values (n, ...) of F, parameters and state."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
-        taken = {name: values[name][rows] for name in ("F", *self._shapes)}
-        taken["F"] = taken["F"][:, : self._stretches, : self._stretches]
-        return self.points.at(cells, x, points.volume0[rows], **taken)
+        inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
+        inputs["F"] = inputs["F"][:, : self._stretches, : self._stretches]
+        return self.points.at(cells, x, points.volume0[rows], **inputs)
 
     @cached_property
     def _stress(self) -> PointExpression:
@@ -330,11 +330,11 @@ class ConductivityAtPieces:
             rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
             chosen = np.isin(material, rows)
             out[chosen] = k.evaluate(data)[chosen]
-            bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
-            shown = [f"k = {out[i]:g} at {data.x[i] + data.points.grid.base}" for i in bad]
-            if where := first(self._points.grid.comm, "".join(shown)):
+            invalid = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
+            messages = [f"k = {out[i]:g} at {data.x[i] + data.points.grid.base}" for i in invalid]
+            if message := first(self._points.grid.comm, "".join(messages)):
                 kind = ValueError if begins else NotConverged
-                raise kind(f"conductivity law: {where}, must be >= 0 and finite")
+                raise kind(f"conductivity law: {message}, must be >= 0 and finite")
         return out
 
 

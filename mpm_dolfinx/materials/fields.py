@@ -79,8 +79,8 @@ class SceneMaterials:
         self._used = _used(bodies, len(materials))  # a material without a body has no effect
         evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
         locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
-        asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
-        each = zip(self._used, evaluated, asked, strict=True)
+        in_space = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
+        each = zip(self._used, evaluated, in_space, strict=True)
         known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
         """Number of axes of the deformation gradients of laws."""
@@ -131,14 +131,14 @@ class SceneMaterials:
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
             count = sum(len(body) for body in bodies if body.material == i)
-            self._add_shapes(_spread(m, values, count), seeded, len(points))
+            self._add_shapes(_expanded(m, values, count), seeded, len(points))
             here, rows = _rows(bodies, i, points.id)
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
                 self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
-                mine = np.zeros((len(points), *value.shape[1:]))
-                mine[here] = value[rows]
-                seeded[name] = mine + seeded[name] if name in seeded else mine
+                filled = np.zeros((len(points), *value.shape[1:]))
+                filled[here] = value[rows]
+                seeded[name] = filled + seeded[name] if name in seeded else filled
         seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
@@ -183,8 +183,8 @@ class SceneMaterials:
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
-        if taken := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
-            raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
+        if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
+            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         if "suction" in law.state and self.fluid is not None and m.retention is None:
@@ -222,7 +222,7 @@ class SceneMaterials:
             [name for name in dict.fromkeys([*common, *_takes(law)]) if name != ACROSS or (locks and known)]
             for law, locks, known in self._parts
         ]
-        shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
+        shapes = [{name: getattr(pieces, name).ufl_shape for name in some} for some in names]
         points = [FormPoints(pieces.grid, **s) for s in shapes]
         return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
@@ -290,7 +290,7 @@ class SceneMaterials:
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
-    def felt(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the part of the pore pressure in total stresses at the points (n,), Pa: alpha chi p."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
@@ -342,7 +342,7 @@ class SceneMaterials:
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}
-        return _spread(self.materials[i], values, len(rows))
+        return _expanded(self.materials[i], values, len(rows))
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return all parameters at the points (n, ...); zero if a point's law does not have them."""
@@ -449,7 +449,7 @@ class SceneMaterials:
         """Return the points (n,) whose law has no history."""
         return np.array([not m.state for m in self.materials])[points.material]
 
-    def alike(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return rows (n, c) that are equal at points of the same elastic soil, whatever its initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
@@ -501,7 +501,7 @@ class SceneMaterials:
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
-        return self.effective_stress(points) - self.felt(points)[:, None, None] * np.eye(self.grid.stretches)
+        return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
@@ -517,13 +517,13 @@ class SceneMaterials:
             return points.data
         placed = self._placed(points)
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
-        bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
-        shown = [
+        invalid = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
+        messages = [
             f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]] + self.grid.base}"
-            for law, name, i in bad
+            for law, name, i in invalid
             if len(i)
         ]
-        if message := first(self.grid.comm, "".join(shown[:1])):
+        if message := first(self.grid.comm, "".join(messages[:1])):
             raise NotConverged(message)
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}
         for _, rows, name, values in new:
@@ -586,7 +586,7 @@ def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
 
 def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
     """Return a material with its constants as arrays over the first of its points."""
-    return _spread(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
+    return _expanded(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
 
 
 def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
@@ -610,7 +610,7 @@ def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tupl
     return np.concatenate(here), np.concatenate(rows)
 
 
-def _spread(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
+def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
     """Return a copy of a material with values (n, ...) of some fields, its other numbers repeated n times."""
     out = copy(m)
     for name in constants_of(m):

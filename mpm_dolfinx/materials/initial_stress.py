@@ -35,7 +35,7 @@ class K0:
 
     The vertical stress is the overburden of soil and fluid plus the surcharge, less biot times the pore pressure.  The
     horizontal stresses, radial and circumferential in axisymmetry, are K0 times that.  They are exact for level ground
-    and layers; otherwise they are the starting point of an equilibrium step.
+    and layers; otherwise an equilibrium step follows, with a warning if it changes them by more than 5 %, as on slopes.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ class InitialStresses:
         corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
         base = materials.grid.base
         weight, surface = overburden(corners - base, -gravity[-1] * total[here], points.x)
-        return [weight, surface + base[-1], materials.felt(points)]
+        return [weight, surface + base[-1], materials.pore_stress(points)]
 
 
 def stressed(
@@ -219,7 +219,7 @@ def stressed(
 ) -> MaterialPoints:
     """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); on all processes together.
 
-    In Modified Cam Clay the stress is a constant of the material; other laws get elastic strains, see `_Sought`.
+    In Modified Cam Clay the stress is a constant of the material; others get elastic strains, see `_ElasticStrains`.
 
     Raises
     ------
@@ -237,8 +237,8 @@ def stressed(
         normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
         part = _with(part, given, initial_stress=normal, bulk=-normal.mean(axis=1) / kappa)
     plastic = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
-    now, bad = _Sought(materials, part, target, given, plastic).found()
-    message = "".join(_not_borne(materials, part, target, law[rows], i) for i in np.flatnonzero(bad)[:1])
+    now, missed = _ElasticStrains(materials, part, target, given, plastic).solved()
+    message = "".join(_outside_yield(materials, part, target, law[rows], i) for i in np.flatnonzero(missed)[:1])
     if message := first(comm, message):
         raise ValueError(message)
     if "plastic" in points.data:
@@ -250,7 +250,7 @@ def stressed(
 
 
 @dataclass(frozen=True, eq=False)
-class _Sought:
+class _ElasticStrains:
     """Elastic strains for target stresses, by Newton's method.
 
     The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa;
@@ -295,15 +295,15 @@ class _Sought:
         elastic += (mean / (3 * bulk))[:, None, None] * identity
         return self.of(elastic)
 
-    def off(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
+    def residual(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
         """Return points with elastic strains (n, k), and their stresses minus the target, Pa (n, k)."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
-        logs, turn = np.linalg.eigh(tensor)
-        elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
+        logs, vectors = np.linalg.eigh(tensor)
+        elastic = (vectors * np.exp(2 * logs)[:, None]) @ vectors.swapaxes(1, 2)
         now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
-        stretch = (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
+        stretch = (vectors * np.exp(logs)[:, None]) @ vectors.swapaxes(1, 2)
         now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch)
         stress = self.materials.effective_stress_3d(now)
         return now, self.of(stress - self.target)
@@ -315,7 +315,7 @@ class _Sought:
         (_, shear) = self.moduli()
         slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
         for k in range(count):
-            change = (self.off(strain + SAME * np.eye(count)[k])[1] - missing) / SAME
+            change = (self.residual(strain + SAME * np.eye(count)[k])[1] - missing) / SAME
             slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
         slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
         singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > NEAR**2)
@@ -323,24 +323,24 @@ class _Sought:
         change = np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST)
         return np.clip(strain - change, -1, 1)
 
-    def found(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
+    def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
         """Return points with the strains, and which points (n,) miss the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # round-off for very small strains
         now = self.points
-        bad = np.ones(len(strain), dtype=bool)
+        missed = np.ones(len(strain), dtype=bool)
         try:
             for _ in range(MOST):
-                now, missing = self.off(strain)
-                bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= close)
+                now, missing = self.residual(strain)
+                missed = ~(np.abs(missing).max(axis=1, initial=0.0) <= close)
                 most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
                 if not over_all(comm, most, MPI.MAX) > EXACT * largest:
                     break
                 strain = self.step(strain, missing)
         except NotConverged:
-            bad = np.ones(len(strain), dtype=bool)
-        return now, bad
+            missed = np.ones(len(strain), dtype=bool)
+        return now, missed
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
@@ -385,12 +385,13 @@ def _prestretch(m) -> NDArray[np.float64]:
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
     """Return an error message for stresses (n, 3, 3) that cannot be constants of Modified Cam Clay, or an empty one."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
-    bad = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
+    invalid = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
     what = "must have no shear and a compressive mean for ModifiedCamClay"
-    return "".join(f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, {what}" for i in np.flatnonzero(bad)[:1])
+    first = np.flatnonzero(invalid)[:1]
+    return "".join(f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, {what}" for i in first)
 
 
-def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
+def _outside_yield(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
     name = materials.laws[law[i]].__name__
     allowed = f"inside the yield surface of {name}"
     tension = np.trace(target[i]) > 0  # the pore pressure exceeds the overburden

@@ -156,7 +156,7 @@ class _Equations:
         self._grid = points.grid
         self._by_scene = by_scene
         equations = law.residual or law.solution
-        self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(equations)]
+        self._names = [name for name in (*law.parameters, *law.state) if name in law.arguments_of(equations)]
         self._points = own = FormPoints(points.grid, **{name: getattr(points, name).ufl_shape for name in self._names})
         starts = {name: np.asarray(start, dtype=float) for name, start in law.unknowns.items()}
         self._start = np.concatenate([start.ravel() for start in starts.values()])
@@ -209,8 +209,8 @@ class _Equations:
             out, k = self._slopes.evaluate(at, None, given), trial.shape[1]
             by_y, by_z = out[:, : m * m].reshape(-1, m, m), out[:, m * m :].reshape(n, m, k)
             slopes = -_solve(by_y, by_z)
-            lost = np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2)))
-            self._refuse(data, lost, ".residual: does not determine the unknowns")
+            undetermined = np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2)))
+            self._refuse(data, undetermined, ".residual: does not determine the unknowns")
             if self._bends is None:
                 return Derived(slopes.reshape(n, m * k))
             second = self._bends.evaluate(at, None, given | {"slopes": slopes.reshape(n, m * k)})
@@ -219,10 +219,10 @@ class _Equations:
 
         return Solved(data.key, y, trial, derive)
 
-    def _refuse(self, data: PointData, lost: NDArray[np.int64], why: str) -> None:
+    def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
         """Raise NotConverged if a point on any process is lost, with the first such point; all processes together."""
-        shown = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in lost[:1]]
-        if message := first(self._grid.comm, "".join(shown)):
+        messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
+        if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
@@ -240,27 +240,27 @@ class _Equations:
             return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
 
         def derive() -> Derived:
-            slopes = self._together(lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            slopes = self._concatenated(lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
             self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
             return Derived(slopes.reshape(n, self.count * k))
 
-        y = self._together(solution)
+        y = self._concatenated(solution)
         self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
         return Solved(data.key, y, trial, derive)
 
-    def _together(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
+    def _concatenated(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
         """Return arrays side by side; a ValueError on one process is raised on all."""
-        made, refused = [], ""
+        arrays, reason = [], ""
         try:
-            made = make()
+            arrays = make()
         except ValueError as error:
-            refused = str(error)
-        if message := first(self._grid.comm, refused):
+            reason = str(error)
+        if message := first(self._grid.comm, reason):
             raise ValueError(message)
-        return np.concatenate(made, axis=1)
+        return np.concatenate(arrays, axis=1)
 
     @property
-    def _said(self) -> str:
+    def _title(self) -> str:
         return f"{self._law.__name__}.solution"
 
     def _checked(self, found, n: int) -> dict:
@@ -271,28 +271,28 @@ class _Equations:
         ValueError
             The result is no dict of pairs with the unknowns' names and shapes, or has a derivative by another name.
         """
-        instance(f"{self._said}: its result", found, dict)
+        instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
                 allowed = "must be a pair: values, and a dict of derivatives"
-                raise ValueError(f"{self._said}: {of} = {line(pair)}, {allowed}")
+                raise ValueError(f"{self._title}: {of} = {line(pair)}, {allowed}")
         if set(found) != set(self._unknowns):
             names = (", ".join(map(str, of)) or "nothing" for of in (found, self._unknowns))
-            raise ValueError("{}: gives {}, must give {}".format(self._said, *names))
+            raise ValueError("{}: gives {}, must give {}".format(self._title, *names))
         out = {}
         for of, shape in self._unknowns.items():
             values, slopes = found[of]
             for by in slopes:
                 if by not in self._trial:
                     among = ", ".join(self._trial)
-                    raise ValueError(f"{self._said}: derivative of {of} by {line(by)}, must be by some of {among}")
+                    raise ValueError(f"{self._title}: derivative of {of} by {line(by)}, must be by some of {among}")
             known = {by: slope if callable(slope) else self._slope(of, by, slope, n) for by, slope in slopes.items()}
-            out[of] = _real(f"{self._said}: {of}", values, (n, *shape)), known
+            out[of] = _real(f"{self._title}: {of}", values, (n, *shape)), known
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
         """Return the derivative (n, ..., ...) of an unknown by a trial value; given: this, or a function."""
-        what = f"{self._said}: derivative of {of} by {by}"
+        what = f"{self._title}: derivative of {of} by {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
@@ -328,37 +328,37 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
     system: takes rows (r,) and values (r, m), sets these, and returns f (r, m), df/dy (r, m, m) and norms (r,).
     """
-    rows, lost = np.arange(len(y)), np.zeros(len(y), dtype=bool)
+    rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
     halvings = np.zeros(len(y), dtype=int)
     for _ in range(MOST):
-        step, begun = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
-        solved, lost[rows] = norm <= 4 * EPSILON, ~np.isfinite(step).all(axis=1)
-        step[solved & lost[rows]] = 0.0  # a solution, though it may be one of many
-        lost[rows] &= ~solved
-        close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
-        y[rows] = begun - step  # for close points this is the solution
-        on = ~(close | lost[rows])
+        step, old = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
+        solved, failed[rows] = norm <= 4 * EPSILON, ~np.isfinite(step).all(axis=1)
+        step[solved & failed[rows]] = 0.0  # a solution, though it may be one of many
+        failed[rows] &= ~solved
+        close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
+        y[rows] = old - step  # for close points this is the solution
+        on = ~(close | failed[rows])
         rows = rows[on]
         step = step[on]
-        begun = begun[on]
+        old = old[on]
         norm = norm[on]
         length = np.ones(int(on.sum()))
         if not len(rows):
             break
-        f, slope, new = system(rows, begun - step)
+        f, slope, new = system(rows, old - step)
         while len(worse := np.flatnonzero(~(new < norm) & (halvings[rows] < HALVINGS))):
             length[worse] /= 2
             halvings[rows[worse]] += 1
-            f[worse], slope[worse], new[worse] = system(rows[worse], begun[worse] - length[worse, None] * step[worse])
-        lost[rows] = ~(new < norm)
-        on = ~lost[rows]
+            f[worse], slope[worse], new[worse] = system(rows[worse], old[worse] - length[worse, None] * step[worse])
+        failed[rows] = ~(new < norm)
+        on = ~failed[rows]
         rows = rows[on]
         f = f[on]
         slope = slope[on]
         norm = new[on]
-    lost[rows] = True  # after so many iterations
-    return np.flatnonzero(lost)
+    failed[rows] = True  # after so many iterations
+    return np.flatnonzero(failed)
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -101,10 +101,10 @@ class MohrCoulomb(Frictional):
         with np.errstate(invalid="ignore", divide="ignore"):  # of a diverging iterate, which is refused later
             e = np.log(x) / 2
         order = np.argsort(-e, axis=1, kind="stable")
-        back, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
+        undo, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
         ordered = np.take_along_axis(e, order, axis=1)
         stresses, slopes, flows = _returned(ordered, bulk, shear, sine, sine_flow, strength, cutoff)
-        stresses, slopes = np.take_along_axis(stresses, back, axis=1), slopes[n, back[:, :, None], back[:, None, :]]
+        stresses, slopes = np.take_along_axis(stresses, undo, axis=1), slopes[n, undo[:, :, None], undo[:, None, :]]
         tensor = Coaxial(x, axes, stresses, plane=trial["b"].shape[1] == len(PLANE))
         by_b = {"b": lambda: tensor.tangent(slopes / (2 * x[:, None, :]))}
         return {"stress": (tensor.values, by_b), "flows": (flows, {})}
@@ -122,8 +122,8 @@ class MohrCoulomb(Frictional):
         I = ufl.Identity(3)
         mean = ufl.tr(tau) / 3
         twice_strain = (tau - mean * I) / shear + 2 * mean / (3 * bulk) * I
-        b, back = Isotropic(twice_strain, plane)(ufl.exp), ufl.inv(F)
-        return {"plastic": ufl.conditional(ufl.gt(flows, 0.5), back * b * back.T, plastic)}
+        b, F_inverse = Isotropic(twice_strain, plane)(ufl.exp), ufl.inv(F)
+        return {"plastic": ufl.conditional(ufl.gt(flows, 0.5), F_inverse * b * F_inverse.T, plastic)}
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
@@ -147,10 +147,10 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
         trial, rows = t.copy(), np.flatnonzero(flows)
         for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
             at = _Return(trial[rows], *(v[rows] for v in parameters))
-            ends, of_trial, offence = at.end(few)
-            there = offence <= NEAR**2 * shear[rows] if few is not ALL else slice(None)
-            t[rows[there]], slopes[rows[there]] = ends[there], of_trial[there] @ elastic[rows[there]]
-            rows = np.delete(rows, there)
+            ends, of_trial, violation = at.end(few)
+            accepted = violation <= NEAR**2 * shear[rows] if few is not ALL else slice(None)
+            t[rows[accepted]], slopes[rows[accepted]] = ends[accepted], of_trial[accepted] @ elastic[rows[accepted]]
+            rows = np.delete(rows, accepted)
             if not len(rows):
                 break
     return t, slopes, flows.astype(float)
@@ -203,12 +203,12 @@ class _Return:
                 ends += [self._at(*vertex) for vertex in self._vertices]
         if len(ends) == 1:
             return ends[0]
-        offence = np.array([np.nan_to_num(offends, nan=np.inf) for _, _, offends in ends])
-        best, n = offence.argmin(axis=0), np.arange(len(self._trial))
+        violation = np.array([np.nan_to_num(violations, nan=np.inf) for _, _, violations in ends])
+        best, n = violation.argmin(axis=0), np.arange(len(self._trial))
         stresses, slopes = (np.array([end[i] for end in ends])[best, n] for i in (0, 1))
-        return stresses, slopes, offence[best, n]
+        return stresses, slopes, violation[best, n]
 
-    def _offence(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
+    def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
         """Return the violation (n,), Pa, by stresses, and by multipliers that must be >= 0."""
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
@@ -220,22 +220,22 @@ class _Return:
         gram = normals @ drops
         inverse = 1 / gram if len(faces) == 1 else _inverse(gram)
         slopes = np.eye(3) - drops @ inverse @ normals
-        over = np.einsum("nfi,ni->nf", normals, self._trial) - limits
-        multipliers = np.einsum("nfg,ng->nf", inverse, over)
+        excess = np.einsum("nfi,ni->nf", normals, self._trial) - limits
+        multipliers = np.einsum("nfg,ng->nf", inverse, excess)
         t = self._trial - np.einsum("nif,nf->ni", drops, multipliers)
-        return t, slopes, self._offence(t, multipliers.T)
+        return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
         """Return stresses of a vertex, zero derivatives, and violation; conditions: give quantities >= 0 in flow."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
-        return t, np.zeros((len(t), 3, 3)), self._offence(t, conditions(plastic))
+        return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
         """Return quantities that are >= 0 for an ordered strain in the cone of the flows of all six faces."""
-        total, turn = x.sum(axis=1), self._p - self._q
-        return [total, self._q * total + turn * x[:, 2], self._q * total + turn * (x[:, 1] + x[:, 2])]
+        total, difference = x.sum(axis=1), self._p - self._q
+        return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
         """Return the same for the two faces at t_2 = t_3 and the cut-off of t_1."""

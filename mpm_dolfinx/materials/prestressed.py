@@ -45,15 +45,16 @@ def _everywhere(value) -> Callable:
 def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
     """Return a law with the additional field `seeded_stretch`, F_i (3, 3)."""
     names = ("energy", "kirchhoff", "update", "trial")
-    given = {name: staticmethod(_seen(f, name, knows_space)) for name in names if (f := getattr(law, name)) is not None}
+    used = {name: f for name in names if (f := getattr(law, name)) is not None}
+    given = {name: staticmethod(_from_seeded(f, name, knows_space)) for name, f in used.items()}
     more = {"__annotations__": {"seeded_stretch": Field}, "seeded_stretch": 1.0}
     more |= {"linear": law.linear, "__doc__": law.__doc__}
     return dataclass(frozen=True)(type(law.__name__, (law,), {**given, **more}))
 
 
-def _seen(function: Callable, name: str, knows_space: bool) -> Callable:
+def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
     """Return a function of a law evaluated at F F_i; stresses and energies are per seeded volume."""
-    taken = Skeleton.taken_by(function)
+    names = Skeleton.arguments_of(function)
 
     def of(**given):
         stretch = given["seeded_stretch"]
@@ -62,10 +63,10 @@ def _seen(function: Callable, name: str, knows_space: bool) -> Callable:
             given["F"] = block(F * stretch) if planar(F) else F * stretch
             if not knows_space:
                 given["F"] = ufl.as_matrix([[given["F"][i, j] for j in range(2)] for i in range(2)])
-        out = function(**{argument: given[argument] for argument in taken})
+        out = function(**{argument: given[argument] for argument in names})
         return out / ufl.det(stretch) if name in ("energy", "kirchhoff") else out
 
-    arguments = dict.fromkeys([*taken, "seeded_stretch"])
+    arguments = dict.fromkeys([*names, "seeded_stretch"])
     of.__signature__ = Signature([Parameter(argument, Parameter.KEYWORD_ONLY) for argument in arguments])
     of.__qualname__ = function.__qualname__
     return of

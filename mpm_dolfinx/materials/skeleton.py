@@ -37,7 +37,7 @@ Errors of the drained beam's tip at h = 0.015 m, without and with it: -0.02 and 
 at 0.45, -2.0 and +0.21 % at 0.49, -10.3 and -0.02 % at 0.499; at h = 0.06 m and 0.499: -56 and -0.4 %.
 """
 
-APART = 1e-4
+SEPARATION = 1e-4
 """Relative separation of equal eigenvalues, which keeps their derivatives finite.
 
 Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02.
@@ -164,7 +164,7 @@ class Skeleton:
         for name in ("state", "unknowns"):
             instance(f"{cls.__name__}: {name}", getattr(cls, name), Mapping)
         functions = (cls.energy, cls.kirchhoff, cls.update, cls.trial, cls.residual, cls.solution)
-        names = dict.fromkeys(name for f in functions for name in cls.taken_by(f))
+        names = dict.fromkeys(name for f in functions for name in cls.arguments_of(f))
         cls.by_scene = tuple(name for name in BY_SCENE if name in names)
         own = {"F", *BY_SCENE, *cls.state, *cls.unknowns, *(["trial"] if cls.unknowns else [])}
         cls.parameters = tuple(name for name in names if name not in own)
@@ -172,7 +172,7 @@ class Skeleton:
             cls.linear = False  # a new energy does not inherit the linearity of the base class
 
     @staticmethod
-    def taken_by(function: Callable | None) -> list[str]:
+    def arguments_of(function: Callable | None) -> list[str]:
         """Return the names of the arguments of one of the law's functions."""
         return [] if function is None else list(signature(function).parameters)
 
@@ -350,7 +350,7 @@ class Hencky(Skeleton):
             return bulk / 2 * ln_J**2 + shear * _deviatoric(F)
         C = F.T * F
         if d == 2:
-            deviatoric = _spread(C) ** 2 / 2
+            deviatoric = _stretch_difference(C) ** 2 / 2
         else:
             logs = [ufl.ln(e) / 2 for e in _eigenvalues(C / (ufl.tr(C) / d))]
             deviatoric = sum(l**2 for l in logs) - sum(logs) ** 2 / d
@@ -361,30 +361,30 @@ def _deviatoric(F):
     """Return sum l_i^2 - (sum l_i)^2 / 3 of the logarithmic stretches l_i of an axisymmetric F, as UFL."""
     whole = F.T * F
     C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
-    return _spread(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
+    return _stretch_difference(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
 
 
-def _spread(C):
+def _stretch_difference(C):
     """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
     The eigenvalues over their mean are 1 + radius and 1 - radius.  This has one quotient; second derivatives of
     C / mean would take twice as many divisions.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
-    radius = ufl.sqrt(ratio + APART**2 / 4)
+    radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
     return (ufl.ln(1 + radius) - ufl.ln(1 - radius)) / 2
 
 
-def _eigenvalues(C, apart: float = APART):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; equal ones are separated by `apart`."""
+def _eigenvalues(C, separation: float = SEPARATION):
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; equal ones are separated by `separation`."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
-        radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + apart**2) / 2
+        radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
         return mean + radius, mean - radius
     mean = ufl.tr(C) / 3
     D = C - mean * ufl.Identity(3)
-    r = ufl.sqrt(ufl.inner(D, D) / 6 + (apart / 10) ** 2)
-    phi = ufl.acos((1 - (10 * apart) ** 2) * ufl.det(D) / (2 * r * r * r)) / 3
+    r = ufl.sqrt(ufl.inner(D, D) / 6 + (separation / 10) ** 2)
+    phi = ufl.acos((1 - (10 * separation) ** 2) * ufl.det(D) / (2 * r * r * r)) / 3
     return tuple(mean + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
 
 

@@ -101,7 +101,7 @@ def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, 
     left = returned(*moduli, residual, 0.0, hardened, drag)
     # soil at the apex is torn apart: it has the residual cohesion
     grown = hardened + falling["hardened"]
-    falls = ufl.le(ufl.conditional(ufl.gt(falling["apex"], 0.5), 2 * end, grown), end)
-    out = {name: ufl.conditional(falls, falling[name], left[name]) for name in ("p", "ratio", "hardened")}
+    softens = ufl.le(ufl.conditional(ufl.gt(falling["apex"], 0.5), 2 * end, grown), end)
+    out = {name: ufl.conditional(softens, falling[name], left[name]) for name in ("p", "ratio", "hardened")}
     yields = (ufl.conditional(to["yields"], 1.0, 0.0) for to in (falling, left))
-    return out | {"yields": ufl.gt(ufl.conditional(falls, *yields), 0.5)}
+    return out | {"yields": ufl.gt(ufl.conditional(softens, *yields), 0.5)}

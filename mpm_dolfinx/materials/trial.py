@@ -89,10 +89,10 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
         full = np.empty((n, 3, 3))
         for k, (i, j) in enumerate(SPACE):
             full[:, i, j] = full[:, j, i] = b[:, k]
-        lost = ~np.isfinite(b).all(axis=1)  # of a diverging iterate
-        full[lost] = np.eye(3)
+        invalid = ~np.isfinite(b).all(axis=1)  # of a diverging iterate
+        full[invalid] = np.eye(3)
         x, axes = np.linalg.eigh(full)
-        return np.where(lost[:, None], np.nan, x), axes
+        return np.where(invalid[:, None], np.nan, x), axes
     mean, half = (b[:, 0] + b[:, 1]) / 2, (b[:, 0] - b[:, 1]) / 2
     radius, angle = np.hypot(half, b[:, 3]), np.arctan2(b[:, 3], half) / 2
     axes, (c, s) = np.zeros((n, 3, 3)), (np.cos(angle), np.sin(angle))
@@ -150,9 +150,9 @@ class Coaxial:
         tangent = found[:, :inner]
         tangent[:] = self._outer @ slopes @ (self._outer * twice[:, None]).transpose(0, 2, 1)
         for a, b in self._pairs:
-            apart = x[:, a] - x[:, b]
-            equal = np.abs(apart) <= SAME * np.abs(x[:, a])
-            turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
+            gap = x[:, a] - x[:, b]
+            equal = np.abs(gap) <= SAME * np.abs(x[:, a])
+            spin = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, gap))
             side = self._dyad(a, b)
-            tangent += (2 * turn[:, None] * side)[:, :, None] * (side * twice)[:, None, :]
+            tangent += (2 * spin[:, None] * side)[:, :, None] * (side * twice)[:, None, :]
         return found

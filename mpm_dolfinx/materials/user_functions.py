@@ -59,12 +59,12 @@ def call(function: Callable, kind: str = "UFL", /, **available):
     ValueError
         The function has an unknown argument, or raises.
     """
-    wanted = list(signature(function).parameters)
-    for name in wanted:
+    names = list(signature(function).parameters)
+    for name in names:
         if name not in available:
             raise ValueError(f"{_name(function)}: argument {name!r}, must be some of {', '.join(available)}")
-    given = {name: available[name] for name in wanted}
-    return asked(_name(function), f"{kind} of {', '.join(wanted) or 'no argument'}", lambda: function(**given))
+    given = {name: available[name] for name in names}
+    return asked(_name(function), f"{kind} of {', '.join(names) or 'no argument'}", lambda: function(**given))
 
 
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):

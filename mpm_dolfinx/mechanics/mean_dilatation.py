@@ -64,7 +64,7 @@ class MeanDilatation:
         self._ratios: list[CellSums] = []
         self._stresses: list[StressAtPoints] = []
 
-    def seen(self, points: FormPoints, F):
+    def fbar(self, points: FormPoints, F):
         """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that are defined in the plane only."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
         if self._grid.stretches == 2 and ACROSS not in points.functions:
@@ -96,7 +96,7 @@ class MeanDilatation:
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
-            Its F-bar modification, see `seen`.
+            Its F-bar modification, see `fbar`.
         ratio
             det Delta, of F over that at the start of the step.
         values

@@ -146,7 +146,7 @@ class MomentumForms:
         if self._of_suction is not None and "suction" in law.state:
             p = ufl.variable(self._retentions.at(pressure, points))
             values["suction"] = ufl.max_value(-p, 0.0)
-        seen = self.dilatation.seen(points, F) if locks else F
+        seen = self.dilatation.fbar(points, F) if locks else F
         if law.unknowns:
             self._local[number] = local = LocalUnknowns(law, points, seen, values)
             values, known = values | local.values, values | local.known
@@ -543,9 +543,9 @@ class MomentumProblem:
         both[0] = size if first else np.maximum(size - system.rounding.array_r, 0.0)
         least = np.maximum(scales[parts.of], system.of_whole.array_r / self._tolerance)
         np.divide(size, least, out=both[1], where=size > 0)
-        counts, told = parts.norms(both)
-        told[~(told < np.inf)] = np.inf
-        return relative(counts, scales), told
+        counts, full = parts.norms(both)
+        full[~(full < np.inf)] = np.inf
+        return relative(counts, scales), full
 
     def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
         """Return the forces (d,), N, of the walls by name at u; the residual must have been assembled there."""

@@ -22,13 +22,13 @@ from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
-TOLD = 50
+STIFF_DRY = 50
 """Weight of the corner-based volume ratio of a cell at the start of a step, in units of G / (lambda + 2G), at most 1.
 
 The remaining weight is on the incremental volume ratio of the points. With nu = 0.4999 and a weight of 1 the stress
 changes at a reset of the grid would exceed the stresses that bodies carry.
 """
-STIFF = 8
+STIFF_WET = 8
 """Value of (lambda + 2G) / G at which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 from 0.47.
 
 The difference between corner-based ratio and Q1 field expels water from such skeletons in every step, however short.
@@ -44,10 +44,12 @@ much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % t
 """
 
 
-def told_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
+def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
     """Return the weight of the corner-based volume ratio at the start of a step in the cells of a material."""
     stiffness = material.oedometric / material.shear
-    return np.minimum(np.maximum(2 - stiffness / STIFF, 0.0), 1.0) if wet else np.minimum(1.0, TOLD / stiffness)
+    return (
+        np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
+    )
 
 
 @dataclass(frozen=True)
@@ -149,14 +151,14 @@ class QuadraturePoints:
     def places(self, cut: CutDomains) -> PiecePlaces:
         """Return the positions of the pieces of a cut."""
         pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, cut.hoop), []
-        seen = self._seen(cut, pieces)
-        if len(self.laws) > 1 or seen is not pieces:
+        law_places = self._law_places(cut, pieces)
+        if len(self.laws) > 1 or law_places is not pieces:
             part = cut.to_cells(self._scene.part_of(cut.points))
             rows = [(part == number).nonzero()[0] for number in range(len(self.laws))]
-            parts = [(own, seen.part(own)) for own in rows]
+            parts = [(own, law_places.part(own)) for own in rows]
         return PiecePlaces(pieces, tuple(parts))
 
-    def _seen(self, cut: CutDomains, pieces: Places) -> Places:
+    def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
         """Return the positions at which laws take the gradient: shifted in flowing, dilatant soil, see `SHARE`."""
         if not self._scene.dilates or self._grid.axisymmetric:
             return pieces
@@ -182,7 +184,8 @@ class QuadraturePoints:
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         if self._locks and cut.domains:
-            share = self._scene.locking(points) * self._scene.table(points, lambda m: told_share(m, bool(self._fluid)))
+            share = self._scene.table(points, lambda m: corner_share(m, bool(self._fluid)))
+            share = self._scene.locking(points) * share
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
             if ACROSS in fields:
@@ -232,7 +235,7 @@ class QuadraturePoints:
 
     def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return F, and a stretch across the plane if laws see one, at the pieces of this process's points."""
-        of_materials = self._scene.elastic(points), self._scene.alike(points)
+        of_materials = self._scene.elastic(points), self._scene.soil_rows(points)
         if not self._scene.across:
             return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}
         F = self._linear.at_pieces(cut, in_space(points.F, points.data[ACROSS]), *of_materials)

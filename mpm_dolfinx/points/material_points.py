@@ -185,12 +185,12 @@ class MaterialPoints:
 
         Fields that share an array still share one.
         """
-        made: dict[int, NDArray] = {}
+        cache: dict[int, NDArray] = {}
 
         def once(values: NDArray) -> NDArray:
-            if id(values) not in made:
-                made[id(values)] = function(values)
-            return made[id(values)]
+            if id(values) not in cache:
+                cache[id(values)] = function(values)
+            return cache[id(values)]
 
         arrays = {f.name: once(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
@@ -220,12 +220,12 @@ class MaterialPoints:
         """Return the points of this process after every point went to its destination, ordered by id."""
         arrays = self.arrays
         one = tuple([values is other for other in arrays].index(True) for values in arrays)
-        alike = len(set(exchange.comm.allgather(one))) == 1  # else processes make different numbers of transfers
-        received = (self if alike else self._apart()).map(exchange.send)
+        equal = len(set(exchange.comm.allgather(one))) == 1  # else processes make different numbers of transfers
+        received = (self if equal else self._copied()).map(exchange.send)
         order = received.id.argsort()
         return received.map(lambda rows: rows[order])
 
-    def _apart(self) -> MaterialPoints:
+    def _copied(self) -> MaterialPoints:
         """Return the points with a separate array for each of their fields."""
         arrays = {f.name: getattr(self, f.name).copy() for f in fields(self) if f.name != "data"}
         return type(self)(**arrays, data={name: values.copy() for name, values in self.data.items()})
@@ -233,9 +233,9 @@ class MaterialPoints:
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the indices in `ids` of points of this process, and the indices of these points."""
         at = self.id.searchsorted(ids)
-        here = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
-        here = np.asarray(here, dtype=np.int64)
-        return here, at[here]
+        found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
+        found = np.asarray(found, dtype=np.int64)
+        return found, at[found]
 
 
 _ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data"))

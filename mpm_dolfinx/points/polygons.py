@@ -66,17 +66,17 @@ class Polygons:
         The algorithm is that of Sutherland and Hodgman (1974). A new edge has no number.
         """
         n, k = self.edge.shape
-        here = np.arange(k) < self.count[:, None]
-        beyond = np.where(here, np.einsum("nki,ni->nk", self.x, normal) - level[:, None], 0.0)
+        used = np.arange(k) < self.count[:, None]
+        excess = np.where(used, np.einsum("nki,ni->nk", self.x, normal) - level[:, None], 0.0)
         last, x1 = np.arange(k) == self.count[:, None] - 1, self.after
-        beyond1 = np.where(last, beyond[:, :1], np.roll(beyond, -1, axis=1))
-        inside = beyond <= 0
-        crosses = here & (inside != (beyond1 <= 0))
-        share = np.divide(beyond, beyond - beyond1, out=np.zeros_like(beyond), where=crosses)
-        met = self.x + share[:, :, None] * (x1 - self.x)
-        x = np.stack([self.x, met], axis=2).reshape(n, 2 * k, 2)
+        beyond1 = np.where(last, excess[:, :1], np.roll(excess, -1, axis=1))
+        inside = excess <= 0
+        crosses = used & (inside != (beyond1 <= 0))
+        share = np.divide(excess, excess - beyond1, out=np.zeros_like(excess), where=crosses)
+        crossing = self.x + share[:, :, None] * (x1 - self.x)
+        x = np.stack([self.x, crossing], axis=2).reshape(n, 2 * k, 2)
         edge = np.stack([self.edge, np.where(inside, NONE, self.edge)], axis=2).reshape(n, 2 * k)
-        kept = np.stack([here & inside, crosses], axis=2).reshape(n, 2 * k)
+        kept = np.stack([used & inside, crosses], axis=2).reshape(n, 2 * k)
         return _packed(x, edge, kept)
 
     def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
@@ -86,17 +86,17 @@ class Polygons:
         """
         out = self
         for k in range(others.shape[1]):
-            way = others[:, (k + 1) % others.shape[1]] - others[:, k]
-            normal = np.stack([way[:, 1], -way[:, 0]], axis=1)
-            room = near * np.linalg.norm(normal, axis=1)
-            out = out.cut(normal, np.einsum("ni,ni->n", normal, others[:, k]) + room)
+            edge_vector = others[:, (k + 1) % others.shape[1]] - others[:, k]
+            normal = np.stack([edge_vector[:, 1], -edge_vector[:, 0]], axis=1)
+            tolerance = near * np.linalg.norm(normal, axis=1)
+            out = out.cut(normal, np.einsum("ni,ni->n", normal, others[:, k]) + tolerance)
         return out
 
     def simplified(self, near: float) -> Polygons:
         """Return the polygons without vertices whose next vertex is within the distance `near`, m."""
         k = self.edge.shape[1]
-        here = np.arange(k) < self.count[:, None]
-        return _packed(self.x, self.edge, here & (np.abs(self.after - self.x).max(axis=2) > near))
+        used = np.arange(k) < self.count[:, None]
+        return _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
         """Divide convex polygons into quadrilaterals, by diagonals with the largest smaller part.
@@ -115,10 +115,10 @@ class Polygons:
             at = left.count == most
             if most > 2:
                 some = Polygons(left.x[at][:, :most], left.count[at], left.edge[at][:, :most])
-                part, beyond = some._divided() if most > 4 else (some, None)
+                part, rest = some._divided() if most > 4 else (some, None)
                 found.append((rows[at], *(part._of_four() if part.x.shape[1] == 3 else (part.x, part.edge))))
-                if beyond is not None:
-                    left, rows = left.of(~at)._joined(beyond), np.concatenate([rows[~at], rows[at]])
+                if rest is not None:
+                    left, rows = left.of(~at)._joined(rest), np.concatenate([rows[~at], rows[at]])
                     continue
             left, rows = left.of(~at), rows[~at]
         if not found:
@@ -132,8 +132,8 @@ class Polygons:
         size = 3 if n == 5 else 4
         whole, best = self.area, None
         for first in range(n):
-            turned = np.roll(self.x, -first, axis=1)
-            area = Polygons.rings(turned[:, :size]).area
+            rolled = np.roll(self.x, -first, axis=1)
+            area = Polygons.rings(rolled[:, :size]).area
             least = np.minimum(area, whole - area)
             if best is None:
                 best, start = least, np.zeros(len(whole), dtype=np.int64)
@@ -141,9 +141,9 @@ class Polygons:
             best = np.maximum(least, best)
         order = (start[:, None] + np.arange(n)) % n
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)
-        part, beyond = edge[:, :size].copy(), edge[:, [0, *range(size - 1, n)]]
-        part[:, -1] = beyond[:, 0] = NONE
-        return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], beyond)
+        part, rest = edge[:, :size].copy(), edge[:, [0, *range(size - 1, n)]]
+        part[:, -1] = rest[:, 0] = NONE
+        return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], rest)
 
     def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return vertices (n, 4, 2) and numbers of edges (n, 4) of triangles, with the middle of the longest edge."""

@@ -57,9 +57,9 @@ class Region:
         at = (edges + size[odd] - 1) // 2  # in the middle of the edges inside the body
         place = np.arange(most)[None]
         middle = (x[odd, at] + after[odd, at]) / 2
-        grown = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)
-        grown[np.arange(len(odd)), at + 1] = middle
-        x[odd] = grown
+        padded = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)
+        padded[np.arange(len(odd)), at + 1] = middle
+        x[odd] = padded
         self._size = size + size % 2
         last = np.take_along_axis(x, (self._size - 1)[:, None, None], axis=1)
         x = np.where((np.arange(most) < self._size[:, None])[:, :, None], x, last)
@@ -68,8 +68,8 @@ class Region:
         self.area = ring.area
         self._middle = ring.centroid
         a, b = x - self._middle[:, None], ring.after - self._middle[:, None]
-        sees = np.where(np.arange(most) < self._size[:, None], _cross(a, b), 1.0)
-        self.sound = (sees.min(axis=1) > 0) & (self.area > NEAR)
+        angles = np.where(np.arange(most) < self._size[:, None], _cross(a, b), 1.0)
+        self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
         """Return the filled area of each of `count` cells, from 0 to 1; 1 for cells without a region."""
@@ -110,9 +110,9 @@ def resampled(
     of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
-    gone = np.concatenate([[0.0], np.cumsum(length)])
+    arc = np.concatenate([[0.0], np.cumsum(length)])
     first, stop = (np.searchsorted(of, np.arange(len(P)), side=side) for side in ("left", "right"))
-    ends = gone[first], gone[stop]
+    ends = arc[first], arc[stop]
     out = np.concatenate([P[:, None], np.zeros((len(P), EDGES - 1, 2)), Q[:, None]], axis=1)
     at = np.zeros((len(P), EDGES + 1))
     at[:, 0], at[:, -1] = ends
@@ -125,19 +125,19 @@ def resampled(
         off = joint - a[of]
         far = np.abs(_cross(chord[of], off))
         far /= np.maximum(np.linalg.norm(chord, axis=1), TINY)[of]
-        within = (gone[:-1] > at[of, low]) & (gone[:-1] < at[of, high])
+        within = (arc[:-1] > at[of, low]) & (arc[:-1] < at[of, high])
         far = np.where(within, far, 0.0)
         order = np.lexsort((far, of))
         corner = order[stop - 1]
-        aim = (at[:, low] + at[:, high]) / 2
-        aim = np.where(far[corner] > BENT, gone[corner], aim)
-        at[:, middle] = aim
-        out[:, middle] = (place(aim - NEAR) + place(aim + NEAR)) / 2  # alike from both ends
+        target = (at[:, low] + at[:, high]) / 2
+        target = np.where(far[corner] > BENT, arc[corner], target)
+        at[:, middle] = target
+        out[:, middle] = (place(target - NEAR) + place(target + NEAR)) / 2  # alike from both ends
 
-    def place(aim: NDArray[np.float64]) -> NDArray[np.float64]:
+    def place(target: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the places (n, 2) so far, in cells, along the parts."""
-        part = np.clip(np.searchsorted(gone, aim, side="right") - 1, first, stop - 1)
-        t = (aim - gone[part]) / np.maximum(length[part], TINY)
+        part = np.clip(np.searchsorted(arc, target, side="right") - 1, first, stop - 1)
+        t = (target - arc[part]) / np.maximum(length[part], TINY)
         return x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
 
     step = EDGES
@@ -150,9 +150,9 @@ def resampled(
     bulge = sum_by(of, _cross(a, b), len(P)) + sum_by(of[1:], _cross(b[:-1], gap), len(P))
     y = out - P[:, None]
     has = _cross(y[:, :-1], y[:, 1:]).sum(axis=1)
-    way = out[:, 2:] - out[:, :-2]
-    normal = np.stack([way[:, :, 1], -way[:, :, 0]], axis=2)
-    size = np.maximum(np.linalg.norm(way, axis=2), TINY)
+    chords = out[:, 2:] - out[:, :-2]
+    normal = np.stack([chords[:, :, 1], -chords[:, :, 0]], axis=2)
+    size = np.maximum(np.linalg.norm(chords, axis=2), TINY)
     shift = (bulge - has) / size.sum(axis=1)
     out[:, 1:-1] += shift[:, None, None] * normal / size[:, :, None]
     return np.clip(out, 0.0, 1.0)

@@ -78,17 +78,17 @@ class PoreWater:
             if not bad.any():
                 return p
             low, high = np.where(off < 0, y, low), np.where(off > 0, y, high)
-            rises = sum_by(self.slot, self.store * np.exp(at / self.bulk) + self.pores * slope, count)
-            rises = rises * np.where(y < 0, scale * np.cosh(y), scale)
+            slopes = sum_by(self.slot, self.store * np.exp(at / self.bulk) + self.pores * slope, count)
+            slopes = slopes * np.where(y < 0, scale * np.cosh(y), scale)
             with np.errstate(divide="ignore", invalid="ignore"):
-                there = y - np.clip(np.nan_to_num(off / rises), -2, 2)
+                new = y - np.clip(np.nan_to_num(off / slopes), -2, 2)
                 middle = (low + high) / 2
-            inside = (there > low) & (there < high)
-            there = np.where(inside | ~np.isfinite(middle), there, middle)
-            done = (there == y) | (high - low <= 4 * EPSILON * np.abs(y))
+            inside = (new > low) & (new < high)
+            new = np.where(inside | ~np.isfinite(middle), new, middle)
+            done = (new == y) | (high - low <= 4 * EPSILON * np.abs(y))
             if not (bad & ~done).any():
                 return p
-            y = np.where(bad, there, y)
+            y = np.where(bad, new, y)
         raise NotConverged("pore water: no pressure is found for the water content")
 
 

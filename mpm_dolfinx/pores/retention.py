@@ -477,7 +477,7 @@ def restrained(
     p: NDArray[np.float64],
     dp: NDArray[np.float64],
     scale: NDArray[np.float64] | float,
-    went: NDArray[np.float64] | float = 0.0,
+    previous: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
     """Return limited pressure decreases (n,), Pa, of a Newton step.
 
@@ -491,14 +491,14 @@ def restrained(
         Pressures, and their decreases by Newton's method.
     scale : (n,), Pa
         Characteristic suction.
-    went : (n,)
+    previous : (n,)
         Change of their `logarithm` in the step before.
     """
-    there, turn = p - dp, -scale
-    there = np.where((p - turn) * (there - turn) < 0, turn, there)
-    here, y = logarithm(p, scale), logarithm(there, scale)
-    most = np.where(went * (y - here) < 0, np.minimum(np.abs(went) / 2, FARTHEST), FARTHEST)
-    far = (np.abs(y - here) > most) & (np.minimum(here, y) < 0)
-    y = here + np.clip(y - here, -most, most)
-    there = np.where(far, pressure_at(y, scale), there)
-    return np.where(there == p - dp, dp, p - there)
+    new, limit = p - dp, -scale
+    new = np.where((p - limit) * (new - limit) < 0, limit, new)
+    old, y = logarithm(p, scale), logarithm(new, scale)
+    most = np.where(previous * (y - old) < 0, np.minimum(np.abs(previous) / 2, FARTHEST), FARTHEST)
+    far = (np.abs(y - old) > most) & (np.minimum(old, y) < 0)
+    y = old + np.clip(y - old, -most, most)
+    new = np.where(far, pressure_at(y, scale), new)
+    return np.where(new == p - dp, dp, p - new)

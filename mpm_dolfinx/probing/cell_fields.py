@@ -81,8 +81,8 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
             full, _, chi, _ = scene.materials.saturation(points, at, cut.pieces.point)
             share, full = share * cut.pieces_to_cells(chi), cut.pieces_to_cells(full)
             volumes -= (1 - full) * pores * np.exp(pressure / scene.fluid.bulk)[places.slots]
-        owed = cut.to_cells(points.data["owed"] / points.J)
-        water = sum_by(places.slots, weight * (volumes - owed), len(volume))
+        defect = cut.to_cells(points.data["owed"] / points.J)
+        water = sum_by(places.slots, weight * (volumes - defect), len(volume))
         stress = effective - (mean(share) * pressure)[:, None, None] * np.eye(scene.grid.stretches)
     x = mean(cut.x) + cut.grid.base
     return CellFields(places.filled, x, volume, moved, effective, stress, pressure, water)

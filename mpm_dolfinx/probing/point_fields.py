@@ -42,7 +42,7 @@ class PointFields:
 def point_fields(scene: Scene, points: MaterialPoints) -> PointFields:
     """Return the fields of some points; all processes call it together."""
     materials, effective = scene.materials, scene.materials.effective_stress_3d(points)
-    pore = materials.felt(points)
+    pore = materials.pore_stress(points)
     mean = np.trace(effective, axis1=1, axis2=2) / 3
     deviator, stress = (effective - part[:, None, None] * np.eye(3) for part in (mean, pore))
     q = np.sqrt(1.5 * np.square(deviator).sum(axis=(1, 2)))

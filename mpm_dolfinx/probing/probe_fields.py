@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
-REACH = int(RADIUS)
+CELLS = int(RADIUS)
 """Cells along each axis from a probe's cell to the last one with a weight in `LocalFit`."""
 
 
@@ -45,16 +45,16 @@ class _Lattice:
     """Blocks of (2 REACH + 1)^d cells around the cells of m probes.
 
     number (m, cells): lexicographic numbers, -1 outside the grid; midpoint, size (m, cells, d), m; middle: index of the
-    probe's cell in its block; stride (d,): index increment along each axis; beside: for each axis and end, the cells
-    that have a neighbour there, and these neighbours.
+    probe's cell in its block; stride (d,): index increment along each axis; neighbours: for each axis and end, cells
+    with a neighbour there, and these neighbours.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
-        d, width = grid.dim, 2 * REACH + 1
+        d, width = grid.dim, 2 * CELLS + 1
         copy, number = np.divmod(cell, grid.cells)
         index = np.stack(np.unravel_index(number, tuple(grid.shape)), axis=1)
         steps = np.stack(np.unravel_index(np.arange(width**d), (width,) * d), axis=1)
-        there = index[:, None] + steps - REACH
+        there = index[:, None] + steps - CELLS
         inside = ((there >= 0) & (there < grid.shape)).all(axis=2)
         number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
@@ -63,11 +63,11 @@ class _Lattice:
         self.size = self.size.reshape(there.shape)
         self.middle = len(steps) // 2
         self.stride = width ** np.arange(d)[::-1]
-        self.beside = {}
+        self.neighbours = {}
         for axis, end in np.ndindex(d, 2):
             step = steps[:, axis] + 2 * end - 1
             rows = np.flatnonzero((step >= 0) & (step < width))
-            self.beside[axis, end] = rows, rows + (2 * end - 1) * self.stride[axis]
+            self.neighbours[axis, end] = rows, rows + (2 * end - 1) * self.stride[axis]
 
 
 class _Around:
@@ -85,15 +85,15 @@ class _Around:
         points = cut.points
         d = scene.grid.dim
         m = len(probes.id)
-        alike = np.column_stack([scene.materials.conducting(points), points.material])
+        soils = np.column_stack([scene.materials.conducting(points), points.material])
         here, at = points.find(probes.id)
         own = np.zeros((m, d + 4))
         x = interpolate(points.corners[at], probes.xi[here]) if cut.domains else points.x[at]
-        own[here] = np.column_stack([x, alike[at], cut.cells_at(at, x)])
+        own[here] = np.column_stack([x, soils[at], cut.cells_at(at, x)])
         x, key, cell = np.split(over_all(scene.grid.comm, own), [d, d + 3], axis=1)
         self._lattice = lattice = _Lattice(scene.grid, cell[:, 0].astype(np.int64))
         self._x = x
-        self._local, rows = self._gathered(on_grid, on_grid.pressures(state), cut.to_cells(alike))
+        self._local, rows = self._gathered(on_grid, on_grid.pressures(state), cut.to_cells(soils))
         ends = np.cumsum([1, 1, d, d, d, 3])
         filled, p, self._half, self._kappa, self._shift, held, share = np.split(rows, ends, axis=2)
         self._filled = filled[..., 0] > 0
@@ -104,10 +104,10 @@ class _Around:
         wet = Wet(cut, points, self._contents, state.t)
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
-    def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], alike: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local numbers (m, cells) of owned cells, -1 for others, and the data of all cells.
 
-        p: pressures of the filled owned cells, Pa; alike (k, 3): keys of conductivity, its law and material of the cut
+        p: pressures of the filled owned cells, Pa; soils (k, 3): keys of conductivity, its law and material of the cut
         subdomains.  Columns of the data: 1 for filled cells, p, centroid, mobility, shift, keys (nan if the subdomains
         of a cell differ), open fractions.
         """
@@ -118,8 +118,8 @@ class _Around:
         mobility = on_grid.resting_mobility()
         slot = contents.slot(on_grid.cut.cells)
         held = np.zeros((len(filled), 3))
-        held[slot] = alike  # of any cut subdomain in the cell
-        held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (alike != held[slot]).T], axis=1)] = np.nan
+        held[slot] = soils  # of any cut subdomain in the cell
+        held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (soils != held[slot]).T], axis=1)] = np.nan
         one = np.ones((len(filled), grid.dim))
         kappa = mobility.mean[:, None] * (one if mobility.share is None else mobility.share)
         shift = 0 * one if mobility.shift is None else mobility.shift
@@ -143,21 +143,21 @@ class _Around:
         """
         same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
-        alike = levels[-1].copy()
+        groups = levels[-1].copy()
         for level in levels[1::-1]:
             some = level.any(axis=1)
-            alike[some] = level[some]
-        start = np.zeros_like(alike)
+            groups[some] = level[some]
+        start = np.zeros_like(groups)
         start[:, self._lattice.middle] = True
-        reached, passes = start & self._filled, alike | start
-        for _ in range(2 * REACH * self._grid.dim):
-            for (axis, end), (here, there) in self._lattice.beside.items():
+        reached, passes = start & self._filled, groups | start
+        for _ in range(2 * CELLS * self._grid.dim):
+            for (axis, end), (here, there) in self._lattice.neighbours.items():
                 reached[:, there] |= (reached & passes)[:, here] & self._opening(axis, end)
-        return reached & alike, reached
+        return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
         """Return which pairs of neighbours (m, n) along an axis have an open face between them."""
-        here, there = self._lattice.beside[axis, end]
+        here, there = self._lattice.neighbours[axis, end]
         return (self._open[:, here, axis, end] > 0) & (self._open[:, there, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,7 +170,7 @@ class _Around:
         if comm.rank == 0:  # data that all processes share
             probe, place = np.nonzero(self._counts)
             rows += [(probe, self._centroid[probe, place], head[probe, place], np.ones(len(probe)))]
-            rows += self._beside_others(head)
+            rows += self._outside_faces(head)
         fit = LocalFit(len(base), self._grid.dim, 2)
         for probe, away, values, part in rows:
             y = away / self._lattice.size[probe, self._lattice.middle]
@@ -190,46 +190,46 @@ class _Around:
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
             stride, h = self._lattice.stride[axis], self._lattice.size[:, :, axis]
-            beside = {}
-            for way in (-1, 1):
-                j = i + way * stride
-                beside[way] = self._filled[:, j] & (self._open[:, i, axis, (way + 1) // 2] > 0)
-                beside[way] &= self._open[:, j, axis, (1 - way) // 2] > 0
-                low = np.where(beside[way], np.minimum(low, head[:, j]), low)
-                high = np.where(beside[way], np.maximum(high, head[:, j]), high)
-            for way in (-1, 1):
-                j, k = i - way * stride, i - 2 * way * stride
+            filled = {}
+            for sign in (-1, 1):
+                j = i + sign * stride
+                filled[sign] = self._filled[:, j] & (self._open[:, i, axis, (sign + 1) // 2] > 0)
+                filled[sign] &= self._open[:, j, axis, (1 - sign) // 2] > 0
+                low = np.where(filled[sign], np.minimum(low, head[:, j]), low)
+                high = np.where(filled[sign], np.maximum(high, head[:, j]), high)
+            for sign in (-1, 1):
+                j, k = i - sign * stride, i - 2 * sign * stride
                 to, before = (
                     (head[:, a] - head[:, b])
-                    / np.maximum(way * (self._centroid[:, a, axis] - self._centroid[:, b, axis]), h[:, i] / 2)
+                    / np.maximum(sign * (self._centroid[:, a, axis] - self._centroid[:, b, axis]), h[:, i] / 2)
                     for a, b in ((i, j), (j, k))
                 )
                 before = np.where(self._counts[:, k], van_leer(np.stack([to, before], axis=1)), to)
                 on = np.where(before * to > 0, np.sign(to) * np.minimum(np.abs(before), np.abs(2 * to - before)), 0.0)
-                on = on * np.maximum(-way * self._centroid[:, i, axis], 0)
-                on[~(self._counts[:, i] & self._counts[:, j] & beside[-way] & ~beside[way])] = 0.0
+                on = on * np.maximum(-sign * self._centroid[:, i, axis], 0)
+                on[~(self._counts[:, i] & self._counts[:, j] & filled[-sign] & ~filled[sign])] = 0.0
                 low, high = low + np.minimum(on, 0), high + np.maximum(on, 0)
         return low, high
 
-    def _beside_others(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
+    def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
         """Return probes, offsets, heads and weights at faces to cells outside the fit, by the two-point flux."""
         out = []
-        for (axis, end), pair in self._lattice.beside.items():
-            here, there = pair
+        for (axis, end), pair in self._lattice.neighbours.items():
+            own_cells, other_cells = pair
             inward = (1 - 2 * end, 2 * end - 1)  # from the face
-            ways = [
-                np.maximum(self._lattice.size[:, cells, axis] / 2 + way * (self._half + self._shift)[:, cells, axis], 0)
-                for way, cells in zip(inward, pair, strict=True)
+            size, offset = self._lattice.size[:, :, axis], (self._half + self._shift)[:, :, axis]
+            lengths = [
+                np.maximum(size[:, i] / 2 + sign * offset[:, i], 0) for sign, i in zip(inward, pair, strict=True)
             ]
             with np.errstate(divide="ignore", invalid="ignore"):
-                own, other = (way / self._kappa[:, cells, axis] for way, cells in zip(ways, pair, strict=True))
+                own, other = (length / self._kappa[:, i, axis] for length, i in zip(lengths, pair, strict=True))
                 share = own / (own + other)
-            meets = self._counts[:, here] & self._reached[:, there] & ~self._counts[:, there]
-            probe, k = np.nonzero(meets & self._opening(axis, end) & np.isfinite(own) & np.isfinite(share))
-            offset = self._centroid[probe, here[k]]
-            offset[:, axis] -= inward[0] * ways[0][probe, k]
-            rise = share[probe, k] * (head[probe, there[k]] - head[probe, here[k]])
-            out.append((probe, offset, head[probe, here[k]] + rise, np.ones(len(k))))
+            outer = self._counts[:, own_cells] & self._reached[:, other_cells] & ~self._counts[:, other_cells]
+            probe, k = np.nonzero(outer & self._opening(axis, end) & np.isfinite(own) & np.isfinite(share))
+            offset = self._centroid[probe, own_cells[k]]
+            offset[:, axis] -= inward[0] * lengths[0][probe, k]
+            increment = share[probe, k] * (head[probe, other_cells[k]] - head[probe, own_cells[k]])
+            out.append((probe, offset, head[probe, own_cells[k]] + increment, np.ones(len(k))))
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
@@ -245,9 +245,9 @@ class _Around:
         face = order[np.arange(len(row)) + np.repeat(first - np.cumsum(last - first) + last - first, last - first)]
         flows = (sides.shape > 0)[face] & ~(sides.seeps[face] & (self._p[probe, place][row] <= sides.pressure[face]))
         row, face = row[flows], face[flows]
-        offset, axis = self._centroid[probe, place][row] + sides.reach[face], np.abs(sides.normal[face]).argmax(axis=1)
-        looks = 2 * axis + (sides.normal[face, axis] > 0)
-        side, group = np.unique(2 * d * row + looks, return_inverse=True)
+        offset, axis = self._centroid[probe, place][row] + sides.offset[face], np.abs(sides.normal[face]).argmax(axis=1)
+        direction = 2 * axis + (sides.normal[face, axis] > 0)
+        side, group = np.unique(2 * d * row + direction, return_inverse=True)
         area = np.linalg.norm(sides.area[face], axis=1)
         columns = np.column_stack([offset, sides.pressure[face] - offset @ weight]) * area[:, None]
         total = sum_by(group, area, len(side))

@@ -41,9 +41,10 @@ class Probes:
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
             raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
         body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
-        gone = np.flatnonzero(~np.asarray(present)[body])
-        if len(gone):
-            raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in a body that is present")
+        absent = np.flatnonzero(~np.asarray(present)[body])
+        if len(absent):
+            first = absent[0]
+            raise ValueError(f"probe at {self.x0[first]}: in body {body[first]}, must be in a body that is present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, on every process."""
@@ -66,16 +67,16 @@ def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> 
     """Raise a ValueError if renewal has replaced the domain of a probe."""
     found = np.zeros(len(probes.id))
     found[points.find(probes.id)[0]] = 1.0
-    lost = np.flatnonzero(over_all(comm, found) == 0)
-    if len(lost):
-        what = f"probe at {probes.x0[lost[0]]}: its domain was renewed in a run without this probe"
+    missing = np.flatnonzero(over_all(comm, found) == 0)
+    if len(missing):
+        what = f"probe at {probes.x0[missing[0]]}: its domain was renewed in a run without this probe"
         raise ValueError(f"{what}, must be given to all runs, or leave out Numerics(renewal=True)")
 
 
 def _same(a: Body, b: Body) -> bool:
     """Return whether two bodies have the same points."""
-    alike = len(a) == len(b) and a.dim == b.dim
-    return a is b or (alike and all(np.array_equal(a.lower_of(p), b.lower_of(p)) for p in in_chunks(len(a))))
+    equal = len(a) == len(b) and a.dim == b.dim
+    return a is b or (equal and all(np.array_equal(a.lower_of(p), b.lower_of(p)) for p in in_chunks(len(a))))
 
 
 def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:

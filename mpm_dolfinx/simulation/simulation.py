@@ -121,7 +121,7 @@ class Simulation:
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         velocity = checked_velocity(grid, quadrature, inertia, velocity)
-        began = time.perf_counter()
+        start = time.perf_counter()
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(
             grid,
@@ -139,7 +139,7 @@ class Simulation:
         self.state = first_state(self.scene, given, later)
         if initial:
             self.state = balanced(self.scene, self.state)
-        self.jit = time.perf_counter() - began
+        self.jit = time.perf_counter() - start
         """Time for compiling or loading the forms, s."""
 
     def __str__(self) -> str:

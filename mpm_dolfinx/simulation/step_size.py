@@ -81,13 +81,13 @@ class StepSize:
         slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(control.small, self.longest)
         return target - t <= slack
 
-    def least(self, wanted: float, t: float) -> float:
+    def least(self, size: float, t: float) -> float:
         """Return the smallest step, s, allowed at time t, s, for a nominal step, s."""
-        return max(MIN_CUT_BY_ERROR * wanted, FINEST * abs(t)) if self.by_error else MIN_CUT * wanted
+        return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
-    def wanted(self, taken: float) -> float:
+    def preferred(self, size: float) -> float:
         """Return the nominal step, s, for `least`, from the first trial step, s."""
-        return taken if self.by_error else self.longest
+        return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
         """Return the length of the next step, s: `small`, fitted to the time left until the next output."""
@@ -97,42 +97,42 @@ class StepSize:
         # steps that fit up to rounding all have the same length
         return left if not left > (1 - SAME) * small else small
 
-    def refused(self, taken: float, report: Report, control: StepControl) -> float:
+    def refused(self, size: float, report: Report, control: StepControl) -> float:
         """Return the factor by which a solved step must shrink to meet the error tolerance; 1 if it is accepted.
 
         After a jump of the loads one long step overshoots by up to a fifth of the remaining change; two halves do not.
         """
         if not self.by_error:
-            return 0.5 if taken > 0.75 * self.longest and self._rings(taken, report, control) else 1.0
+            return 0.5 if size > 0.75 * self.longest and self._rings(size, report, control) else 1.0
         # most refused steps are at jumps or kinks of the loads, where the error is of first order
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
-    def next(self, taken: float, report: Report, control: StepControl, failed: bool) -> float:
+    def next(self, size: float, report: Report, control: StepControl, failed: bool) -> float:
         """Return the next trial step after a completed one, s; failed: whether a longer one had not converged."""
         if not self.by_error:
-            grows = report.easy and not self._rings(taken, report, control)  # twice the step would be refused
-            return max(control.small, min(2 * taken, self.longest)) if grows else control.small
+            grows = report.easy and not self._rings(size, report, control)  # twice the step would be refused
+            return max(control.small, min(2 * size, self.longest)) if grows else control.small
         factor = self._factor(report, control, 0.5)
         if factor >= 1:
             # a step as long as a failed one mostly fails again: 78 cuts in place of 1 in soil that yields
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
-            return min(max(taken * factor, control.small), self.longest)  # it may have been shortened for an output
-        return taken * factor
+            return min(max(size * factor, control.small), self.longest)  # it may have been shortened for an output
+        return size * factor
 
-    def cut(self, taken: float, control: StepControl) -> StepControl:
+    def cut(self, size: float, control: StepControl) -> StepControl:
         """Return the step control with half a step, s, as the next trial, after a step without convergence."""
-        whole = taken > (1 - SAME) * control.small
+        whole = size > (1 - SAME) * control.small
         waits = 2 * control.waits + 1 if whole and control.kept == 0 else control.waits
-        return replace(control, small=taken / 2, waits=waits, kept=1)
+        return replace(control, small=size / 2, waits=waits, kept=1)
 
-    def grown(self, taken: float, report: Report, control: StepControl, failed: bool) -> StepControl:
+    def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
         """Return the step control with the next trial step after a completed step, s; failed: see `next`.
 
         Equal steps grow at once after a cut, until a newly grown step fails too. They then wait for one more step, for
         three, seven and so on. Half the wait remains when a newly grown step converges. `waits` is this number; `kept`
         counts the steps since the last cut or growth: 0 directly after growth.
         """
-        small, whole = self.next(taken, report, control, failed), taken > (1 - SAME) * control.small
+        small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
             return replace(control, small=small)
         waits = control.waits // 2 if whole and control.kept == 0 else control.waits
@@ -141,13 +141,13 @@ class StepSize:
         # a step fitted to an output says nothing about longer ones
         return replace(control, waits=waits, kept=control.kept + whole)
 
-    def _rings(self, taken: float, report: Report, control: StepControl) -> bool:
+    def _rings(self, size: float, report: Report, control: StepControl) -> bool:
         """Return whether a step may have overshot a jump.
 
         A step leaves at most a fifth of a jump of the loads. A change that is equally sudden in successive steps is
         therefore no jump. An edge pushed into a body causes such changes: the grid is reset in every step.
         """
-        return report.sudden - AGAIN * control.first * taken > RINGS * control.change
+        return report.sudden - AGAIN * control.first * size > RINGS * control.change
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
         """Return the length of a step with the tolerated error, relative to a solved step."""

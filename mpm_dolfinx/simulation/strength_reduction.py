@@ -89,7 +89,8 @@ def factor_of_safety(
     """Return the factor of safety by strength reduction: bodies slide when their strength is divided by more than it.
 
     The simulation is unchanged. A scene that cannot stand needs no run: trials start from an elastic step of dt. The
-    call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided.
+    call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided. The factor
+    of a thin weak layer at the surface depends on `rtol`: where it slides alone, its share of the load decides.
 
     Parameters
     ----------
@@ -239,7 +240,7 @@ class _Weakened:
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: contacts: must be none")
-        begun = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data of its grid
+        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data of its grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
         def resistance(points, u, dt):
@@ -259,10 +260,10 @@ class _Weakened:
             extensions=([*terms, resistance], sources),
             initial={},  # the materials already have their data for initial stresses
         )
-        self._strengths, self.newton = _strengths(scene, begun.points), []
-        points = replace(begun.points, data={**begun.points.data, **self._strengths})
-        begun = begin_stage(self._scene, replace(begun, points=points), {}, [], [], False, {})
-        self._start = self._unyielding(begun)
+        self._strengths, self.newton = _strengths(scene, initial.points), []
+        points = replace(initial.points, data={**initial.points.data, **self._strengths})
+        initial = begin_stage(self._scene, replace(initial, points=points), {}, [], [], False, {})
+        self._start = self._unyielding(initial)
         stress, modulus = _mean_stress(self._scene, self._start.points), _shear_modulus(self._scene, self._start.points)
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
@@ -276,12 +277,12 @@ class _Weakened:
             tell(len(out), out[-1])
         return np.array(out)
 
-    def _unyielding(self, begun: State) -> State:
+    def _unyielding(self, initial: State) -> State:
         """Return the state after a step with soil that does not yield below strains of one."""
-        moduli = self._scene.materials.table(begun.points, lambda m: m.oedometric)
-        trial = self._trial(begun, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
+        moduli = self._scene.materials.table(initial.points, lambda m: m.oedometric)
+        trial = self._trial(initial, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
         self._go_on(trial, "soil that cannot yield")
-        return replace(trial.state, t=begun.t)
+        return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
         """Return a trial that starts from a state, with other strengths at its points."""
@@ -309,8 +310,8 @@ class _Weakened:
         volume, size = (now.volume0 * now.J)[new], partial(np.linalg.norm, axis=(1, 2))
         viscous = 2 * float(self._viscosity.value) / self._dt * size(strain) ** 2
         work = np.array([volume @ viscous, volume @ (size(_deviator(stress)) * size(_deviator(strain)))])
-        borne, whole_work = over_all(self._scene.grid.comm, work)
-        return float(borne / whole_work) if borne > 0 else 0.0
+        viscous_work, whole_work = over_all(self._scene.grid.comm, work)
+        return float(viscous_work / whole_work) if viscous_work > 0 else 0.0
 
 
 def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -121,10 +121,10 @@ def imbalance(scene: Scene, state: State) -> dict[str, float]:
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None
-    mine = [len(state.points), len(pieces.cells), len(pieces.places.filled)] if pieces else [len(state.points), 0, 0]
-    mine = np.array(mine, dtype=float)
-    total, most = over_all(comm, mine), over_all(comm, mine, MPI.MAX)
-    ratio = np.divide(most * comm.size, total, out=np.ones_like(mine), where=total > 0)
+    counts = [len(state.points), len(pieces.cells), len(pieces.places.filled)] if pieces else [len(state.points), 0, 0]
+    counts = np.array(counts, dtype=float)
+    total, most = over_all(comm, counts), over_all(comm, counts, MPI.MAX)
+    ratio = np.divide(most * comm.size, total, out=np.ones_like(counts), where=total > 0)
     return dict(zip(("points", "pieces", "active cells"), ratio.tolist(), strict=True))
 
 

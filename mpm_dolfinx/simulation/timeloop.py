@@ -263,8 +263,8 @@ def _histories(
     if after is None:
         motion = 0.0 if rule.by_error and state.stage.inertia else None
         before = 0.0 if control is None else control.first
-        begun = StepControl(times.interval, rule.first, first=before, motion=motion)
-        return Result(Rows([_row(simulation, probes)])), begun
+        fresh = StepControl(times.interval, rule.first, first=before, motion=motion)
+        return Result(Rows([_row(simulation, probes)])), fresh
     if latest is None or control is None or after.rows.run is not latest.rows.run:
         raise ValueError("after: histories of another run, must be of the last one, or a result of `resume`")
     after = latest  # which may have advanced since
@@ -299,22 +299,22 @@ class _Stopwatch:
     """Wall time and profile of a run, including the times of the histories that it continues."""
 
     def __init__(self, result: Result):
-        self._began = time.perf_counter() - result.wall
+        self._start = time.perf_counter() - result.wall
         self._timed = {part: seconds - result.profile.get(part, 0.0) for part, seconds in _timings().items()}
 
     def read(self, result: Result) -> Result:
         """Return the histories with the times so far."""
         profile = {part: seconds - self._timed[part] for part, seconds in _timings().items()}
-        return replace(result, wall=time.perf_counter() - self._began, profile=profile)
+        return replace(result, wall=time.perf_counter() - self._start, profile=profile)
 
 
 def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool, events: Events) -> bool:
+def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
     """Take one step towards the time target, s; return whether an event has ended the run."""
-    step, new = _advance(simulation, rule, target, aloud)
+    step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
     if found is None:
         simulation.state = new
@@ -326,58 +326,58 @@ def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool
 
 
 def _accepted(
-    rule: StepSize, start: State, taken: float, new: State, report: Report, wanted: float | None = None
+    rule: StepSize, start: State, size: float, new: State, report: Report, preferred: float | None = None
 ) -> State:
-    """Return the state after a step of length taken, s, with its histories; wanted: the nominal step, s."""
+    """Return the state after a step of length size, s, with its histories; preferred: the nominal step, s."""
     grown = measured(start.control, report, start.result)
-    grown = rule.grown(taken, report, grown, failed=taken < (1 - SAME) * (wanted or taken))
-    grown = replace(grown, first=0.0 if new.stays else report.first / taken)
+    grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
+    grown = replace(grown, first=0.0 if new.stays else report.first / size)
     return replace(new, result=start.result.after(report), control=grown)
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> tuple[Step, State]:
+def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
     """Return a step towards the time target, s, and its end state; it is cut until it converges and is accurate.
 
-    aloud: warn of the first cut of a run.
+    verbose: warn of the first cut of a run.
     """
     comm = simulation.scene.grid.comm
-    wanted = None
+    preferred = None
     whole = None
     while True:
         state = simulation.state
         result = simulation.state.result
         control = simulation.state.control
-        taken, how = rule.fitted(target - state.t, control.small), ()
-        wanted, whole = wanted or rule.wanted(taken), whole or taken
+        size, how = rule.fitted(target - state.t, control.small), ()
+        preferred, whole = preferred or rule.preferred(size), whole or size
         try:
-            new, report = simulation.advanced(taken)
+            new, report = simulation.advanced(size)
         except StepFailed as failed:
-            cut, counted = rule.cut(taken, control), replace(result, cuts=result.cuts + 1)
-            left = _has_left(failed, rule, taken, state)
-            if not left and cut.small >= rule.least(wanted, state.t):
+            cut, counted = rule.cut(size, control), replace(result, cuts=result.cuts + 1)
+            left = _has_left(failed, rule, size, state)
+            if not left and cut.small >= rule.least(preferred, state.t):
                 _note(simulation, counted, cut)
-                loud = aloud and not result.cuts
-                level, more = (WARNING, "; others: messages of level INFO") if loud else (INFO, "")
-                log(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more, level=level)
+                verbose_step = verbose and not result.cuts
+                level, more = (WARNING, "; others: messages of level INFO") if verbose_step else (INFO, "")
+                log(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, size / 2, failed, more, level=level)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
-                tried = result if left else _note(simulation, counted, replace(cut, small=taken))
-                raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
-            taken = whole
+                tried = result if left else _note(simulation, counted, replace(cut, small=size))
+                raise GaveUp(_why(state.t, size, failed), tried, failed.history) from failed
+            size = whole
             how = (EULER,)
             (new, report) = found
         now = measured(control, report, result)
-        if (shrinks := rule.refused(taken, report, now)) < 1:
-            small = wanted = taken * shrinks
+        if (shrinks := rule.refused(size, report, now)) < 1:
+            small = preferred = size * shrinks
             if state.t + small == state.t:
                 why = f"gave up at t = {state.t:g} s: no step is short enough for rtol = {rule.rtol:g}"
                 raise GaveUp(why, result, report.history)
             _note(simulation, replace(result, rejected=result.rejected + 1), replace(control, small=small))
             continue
-        new = _accepted(rule, state, taken, new, report, wanted)
+        new = _accepted(rule, state, size, new, report, preferred)
         if not rule.by_error and new.control.small > control.small:
             log(comm, "t = %g s: step grows to %.3g s", new.t, new.control.small)
-        return Step(state, taken, how), new
+        return Step(state, size, how), new
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
@@ -397,11 +397,11 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     return found
 
 
-def _has_left(failed: StepFailed, rule: StepSize, taken: float, state: State) -> bool:
+def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
     """Return whether points leave the grid in an accurate step: shorter steps cannot prevent it."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
-    return rule.refused(taken, failed.report, measured(state.control, failed.report, state.result)) == 1
+    return rule.refused(size, failed.report, measured(state.control, failed.report, state.result)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:

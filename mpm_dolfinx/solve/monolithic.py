@@ -82,7 +82,7 @@ class BlockOperator:
         """Multiply by the operator."""
         s, (u, f, p, g) = self.storage, self.work
         self.part(x, u, p)
-        s.lost(u, g, *self.slopes)
+        s.change_by(u, g, *self.slopes)
         s.C.multAdd(p, g, g)
         s.B_momentum.multTranspose(p, f)
         f.scale(-1.0)

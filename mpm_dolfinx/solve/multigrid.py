@@ -129,14 +129,14 @@ def interpolation(
     rows, coarse, weights = _hats(places, nodal, lines)
     beside = _hats(held, nodal, lines)[1]
     whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # weight at the same node, or in the coarse cell
-    says = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(beside), NOT)])
+    states = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(beside), NOT)])
     among = np.concatenate([coarse, beside])
     shape = tuple(int(n) for n in over_all(comm, among.max(axis=0, initial=0), MPI.MAX) + 3)  # indices start at -1
     keys, at = np.unique(np.ravel_multi_index((among + 1).T, shape), return_inverse=True)
-    said = np.full(len(keys), MAYBE)
+    stated = np.full(len(keys), MAYBE)
     for word in (NOT, IS):
-        said[at[says == word]] = word
-    number, mine = _shared(comm, keys, int(np.prod(shape)), said)
+        stated[at[states == word]] = word
+    number, mine = _shared(comm, keys, int(np.prod(shape)), stated)
     column = number[at[: len(coarse)]]
     kept = column != NONE
     rows = rows[kept]
@@ -182,7 +182,7 @@ def _hats(
 
 
 def _shared(
-    comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, said: NDArray[np.int64]
+    comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers (n,) of coarse unknowns, NONE for others, and whether this process owns them (n,).
 
@@ -193,7 +193,7 @@ def _shared(
     ----------
     keys : (n,)
         Candidates of this process, ascending, below `count`.
-    said : (n,)
+    stated : (n,)
         Status of each by the data of this process, MAYBE, NOT or IS; the largest over all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
@@ -204,7 +204,7 @@ def _shared(
         op.at(found, who, ask.send(values))
         return ask.back(found[who])
 
-    rank = np.where(of_all(said, np.maximum) == NOT, NONE, comm.rank)
+    rank = np.where(of_all(stated, np.maximum) == NOT, NONE, comm.rank)
     mine, number = (rank != NONE) & (of_all(rank, np.minimum) == comm.rank), np.full(len(keys), NONE)
     own = np.count_nonzero(mine)
     start = comm.exscan(own) if comm.size > 1 else 0

@@ -374,19 +374,19 @@ class Newton:
         with Timer("mpm: residual"):
             r, forces = self._momentum.residual_of_parts()
             forces = forces if start is None else np.maximum(start, forces)
-            u, told = self._momentum.out_of_balance(r, forces, first)
+            u, error_u = self._momentum.out_of_balance(r, forces, first)
             exchanged = np.zeros(len(u))
-            p = told_p = exchanged
+            p = error_p = exchanged
             fluid, size = None, 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 exchanged, size = fluid.exchanged, float(fluid.off.sum())
                 p = relative(fluid.off, exchanged, fluid.round_off)
-                told_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
+                error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
             where, what = ("storage: a source", size) if np.isfinite(r.norm()) else ("momentum: a law or term", norm)
             raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
-        self.report.history.append((float(told.max(initial=0.0)), float(told_p.max(initial=0.0))))
+        self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:

@@ -333,7 +333,7 @@ class LinearSolvers:
     def condense(self, *slopes: FluxSlope) -> PETSc.Vec:
         """Return the right-hand side of the Schur complement's system, R_p - B K^-1 R_u."""
         self.solve_u.solve(self._momentum.residual, self.du)
-        self._storage.lost(self.du, self._g, *slopes)
+        self._storage.change_by(self.du, self._g, *slopes)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 

@@ -89,7 +89,7 @@ class Motion:
         data: QuadratureData,
         t: float,
         loads: Sequence[Loads],
-        came: NDArray[np.float64] | None = None,
+        net_inflow: NDArray[np.float64] | None = None,
         report: Report | None = None,
         stays: bool = True,
         carried: Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None = None,
@@ -104,7 +104,7 @@ class Motion:
             The bodies on the grid, and their integration points at the start of the step.
         loads
             Loads at the end of the step.
-        came : (n,), m^d
+        net_inflow : (n,), m^d
             Net fluid inflow into the filled owned cells in the step; None leaves the points' volume defect unchanged.
         report
             Report of the step, for the exception if a point leaves the grid.
@@ -132,7 +132,7 @@ class Motion:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
                 points = replace(state.points.strained(F), x=x, corners=corners)
-                keeps, folded = on_grid.serves(points), 0
+                keeps, folded = on_grid.valid(points), 0
             self._check_volumes(points, cut)
             if carried is not None:
                 part, count = on_grid.parts
@@ -150,9 +150,9 @@ class Motion:
                 ids = points.id[cut.pieces.point]
                 of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
-                if cut.domains and came is not None:
-                    owed = self._owed(state, points, on_grid, pieces, came, keeps)
-                    points = replace(points, data=points.data | owed)
+                if cut.domains and net_inflow is not None:
+                    defect = self._volume_defect(state, points, on_grid, pieces, net_inflow, keeps)
+                    points = replace(points, data=points.data | defect)
             _check_inside(cut, points, t, report)
         stays = stays and not (self._materials.retentions and callable(state.stage.conditions["gravity"]))
         stay = Stay(cut.points)
@@ -275,7 +275,7 @@ class Motion:
         for one in loads:
             corners = one.outside(corners, own)
         points = replace(state.points, corners=corners)
-        keeps, evolved = on_grid.serves(points), self._materials.evolved(points)
+        keeps, evolved = on_grid.valid(points), self._materials.evolved(points)
         if over_all(grid.comm, int(not keeps.all())):
             free &= ~keeps[:, None, None]
             corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
@@ -295,13 +295,13 @@ class Motion:
             F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
 
-    def _owed(
+    def _volume_defect(
         self,
         state: State,
         points: MaterialPoints,
         on_grid: OnGrid,
         pieces: PointData,
-        came: NDArray[np.float64],
+        net_inflow: NDArray[np.float64],
         keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points after a step (n,), over reference volumes, and the part `due`.
@@ -319,7 +319,7 @@ class Motion:
         volume = on_grid.contents.total(here)[at]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
         density = np.exp((p + p_n) / (2 * forms.bulk))
-        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[at] / volume))
+        dp, density, inflow_here = map(cut.to_pieces, (p - p_n, density, density * net_inflow[at] / volume))
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)
@@ -329,15 +329,15 @@ class Motion:
             heads = on_grid.heads
             full, empty = (materials.saturation(points, cut.to_pieces(at + heads), of)[0] for at in (p, p_n))
             grown = full * grown + (full - empty) * pores[of] * np.exp(-dp / (2 * forms.bulk))
-        grown = cut.mean(density * grown - came_here)
+        grown = cut.mean(density * grown - inflow_here)
         none = materials.drainage(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)
-        owed = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
+        defect = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
         if not over_all(cut.grid.comm, int(not keeps.all())):
-            return {"owed": owed, "due": np.zeros(len(points))}
+            return {"owed": defect, "due": np.zeros(len(points))}
         part, count = on_grid.parts
         share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
-        mean = self._means(part, count, points.volume0 * ~none, owed) * self._sealed(state, on_grid, pieces)
-        return {"owed": owed, "due": np.where(none | keeps, 0.0, mean[part] + share * (owed - mean[part]))}
+        mean = self._means(part, count, points.volume0 * ~none, defect) * self._sealed(state, on_grid, pieces)
+        return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
 
     def _means(
         self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]

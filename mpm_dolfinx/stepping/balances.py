@@ -106,9 +106,9 @@ class Balances(NamedTuple):
             out["runoff"] = runs
         return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
-    def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
-        """Return the net inflow into the cells in the step, see `StorageProblem.came`; None without fluid."""
-        return self.storage and self.storage.came(rates)
+    def net_inflow(self, rates: Rates | None) -> NDArray[np.float64] | None:
+        """Return the net inflow into the cells in the step, see `StorageProblem.net_inflow`; None without fluid."""
+        return self.storage and self.storage.net_inflow(rates)
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
@@ -190,7 +190,7 @@ def balances(
         return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
     fed = matrices.flow(start.state, weight, start.data, acting.t, dt)
-    lost = before and before.taken(substep.before * dt)
+    lost = before and before.integrated(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     pushed = None if inertia is None else partial(pushed_back, scene, on_grid)

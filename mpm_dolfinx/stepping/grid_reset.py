@@ -27,7 +27,7 @@ from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
-from mpm_dolfinx.flow.nonorthogonal import Gradients, off_facets
+from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.grid.grid import sum_by
@@ -334,7 +334,7 @@ class OnGrid(Keyed):
         if at_rest is not None:
             middle, centroid = self.cut.grid.midpoints, contents.centroid
             seen[cells] -= at_rest(cells, middle[cells] + centroid[cells])
-            beyond = middle[sides.cells] + centroid[sides.cells] + sides.reach
+            beyond = middle[sides.cells] + centroid[sides.cells] + sides.offset
             sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, beyond))
         outer = sides.ahead(contents.slot(sides.cells), seen[contents.filled])
         return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
@@ -365,7 +365,7 @@ class OnGrid(Keyed):
             cut.points, cut.to_pieces(self._storage.p_before.x.array[cut.cells]), cut.pieces.point
         )[3]
         mobility = self._mixed.mobility(full, mean, share, full * np.maximum(cut.pieces_to_cells(k), TINY))
-        return replace(mobility, ways=self._mixed.ways(full, law, count, mobility.shift), **given)
+        return replace(mobility, paths=self._mixed.paths(full, law, count, mobility.shift), **given)
 
     def pore_water(self, points: MaterialPoints) -> PoreWater | None:
         """Return the water in the pieces with the porosities of the points, in unsaturated soil; arrays by cells."""
@@ -406,13 +406,13 @@ class OnGrid(Keyed):
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return (self.contents.total(moves) == 0).nonzero()[0]
 
-    def serves(self, points: MaterialPoints) -> NDArray[np.bool_]:
+    def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return whether each point (n,) stays in its cut: its part hardly moves; groups are tested together."""
-        all_of_them = self.cut.serves(points, np.zeros(len(points), dtype=np.int64), 1)[0]
+        all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
         if all_of_them or self.cut.grid.copies > 1:
             return np.full(len(points), all_of_them)
         part, count = self.parts
-        return self.cut.serves(points, part, count)[part]
+        return self.cut.valid(points, part, count)[part]
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
@@ -536,8 +536,8 @@ class Assembled(Keyed):
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
-            if (form := storage.fluxes.aslant) is not None:
-                facets = form.on(off_facets(on_grid.contents, on_grid.facets))
+            if (form := storage.fluxes.nonorthogonal) is not None:
+                facets = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
                 self._off = facets if facets.some else None
         self._gradients: Latest[Gradients] = Latest()
 
@@ -597,7 +597,7 @@ class Assembled(Keyed):
             return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.reach)
+            where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
             off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
             return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 

@@ -129,13 +129,13 @@ def balanced(scene: Scene, state: State) -> State:
         scene.forget()
         raise ValueError(f"initial_stress: must be in equilibrium with the loads at the start: {error}") from error
     left, count, points, held, rest, outcome = best
-    _told(scene, seeded, points, count, left, any(one.touches for one in problem.loads))
+    _report(scene, seeded, points, count, left, any(one.touches for one in problem.loads))
     rest = _rest(scene, problem.loads, rest) if any(one.stiff for one in problem.loads) else None
     reactions = {name: values for name, values in outcome.items() if name == "reactions"}
     return replace(start.state, points=points, held=held, rest=rest, outcome={**state.outcome, **reactions})
 
 
-def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
+def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
     """Log the changes of the balance; refuse a large relative residual.
 
     Contact (touches) is found in the first step only: a residual is then a warning.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import takes
-from mpm_dolfinx.domains.cut_domains import STAYS
+from mpm_dolfinx.domains.cut_domains import STILL
 from mpm_dolfinx.grid.following import carried, lines_at
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import over_all
@@ -22,7 +22,7 @@ from mpm_dolfinx.stepping.state import State
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
     """Return the state for its next step, with the lines of that step, on which the grid is put.
 
-    A kept cut ends when any line moves by more than `STAYS` cells, the motion of corners that ends it as well.
+    A kept cut ends when any line moves by more than `STILL` cells, the motion of corners that ends it as well.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
             np.abs(new - old)[1:-1] / np.minimum(np.diff(old)[1:], np.diff(old)[:-1])
             for new, old in zip(lines, before, strict=True)
         ]
-        if max(far.max(initial=0.0) for far in moved) <= STAYS:
+        if max(far.max(initial=0.0) for far in moved) <= STILL:
             lines = before
         else:
             state = left(state) if state.stays else state

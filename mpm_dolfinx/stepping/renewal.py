@@ -138,11 +138,11 @@ class Renewal:
         work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs)
         if not work.chosen.any():
             return state, 0
-        new = [work.full(), work.partial(), work.rest]
+        new = [work.full(), work.partial(), work.remainders]
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, touched)
-        kept = ~work.gone
-        gone = points.id[work.gone]
+        kept = ~work.affected
+        gone = points.id[work.affected]
         stay, pieces = state.stay, state.pieces
         if stay is not None:
             rows = _joined(stay.points, made, kept)
@@ -226,7 +226,7 @@ class Renewal:
             if not flat.shape[1]:
                 return np.zeros((n, *values.shape[1:]))
             means = np.stack([sum_by(at, weight * column, n) / total for column in flat[old].T], axis=1)
-            means = means + np.einsum("ni,nik->nk", off, work.rise(flat, group))
+            means = means + np.einsum("ni,nik->nk", off, work.slopes(flat, group))
             low, high = np.full((count, flat.shape[1]), np.inf), np.full((count, flat.shape[1]), -np.inf)
             np.minimum.at(low, groups, flat[gone])
             np.maximum.at(high, groups, flat[gone])
@@ -259,7 +259,7 @@ class Renewal:
         F = ratio[:, None, None] ** (1 / d) * np.eye(d)
         data = {}
         logs = np.zeros((len(points), 3, 3))
-        logs[work.gone] = _log(self._elastic(points, np.flatnonzero(work.gone)))
+        logs[work.affected] = _log(self._elastic(points, np.flatnonzero(work.affected)))
         across = np.exp(mean(np.log(points.data[ACROSS]))) if ACROSS in points.data else None
         data["plastic"] = _pulled(F, across, _exp(kept(logs)))
         for name, values in points.data.items():

@@ -185,19 +185,19 @@ class Scene:
         return MomentumProblem(self.momentum, system, data, loads, self.scheme.tolerance, **options)
 
     @cached_property
-    def _told(self) -> set[str]:
+    def _warned(self) -> set[str]:
         """Subjects of past warnings, which affect the log only."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
         """Warn, once, if the gravity of a step differs from that of the conductivities."""
-        if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._told:
+        if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
             what = "gravity = %.6g m/s^2, but conductivities become mobilities by the fluid's density x 9.81 m/s^2, as "
             what += "gravity changes with time: must be given as Fluid(gravity=...)"
             warn(self.grid.comm, ConditionWarning, what, strength)
-            self._told.add("gravity")
+            self._warned.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's weight for the pressure variation within cells of unsaturated soil, see `Retentions`.

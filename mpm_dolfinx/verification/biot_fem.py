@@ -306,8 +306,8 @@ class BiotFEM:
         F, F_n = (ufl.variable(self._deformation(f)) for f in (u, u_n))
         J, J_n = ufl.det(F), ufl.det(F_n)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
-        felt = self._pores.of("bishop", p) * p
-        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * felt * ufl.diff(J, F)
+        effective = self._pores.of("bishop", p) * p
+        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * effective * ufl.diff(J, F)
         residual, flux = around * ufl.inner(P, self._grad(v)) * dx, None
         points = SimpleNamespace(  # the configuration at the start of the step
             dx=PointMeasure(self.grid.mesh, around * J_n, "everywhere", degree),
@@ -318,14 +318,14 @@ class BiotFEM:
             position=self._places + u_n,
             **parameters,
         )
-        seen = {"points": points, "t": t}
+        arguments = {"points": points, "t": t}
         for term in terms:
             more = {"u": u - u_n, "v": v, "dt": since, "velocity": (u - u_n - past) / dt}
-            residual += 1 / scale * term_of(term, space.w, test, **seen, **more)[0]
-        pull = None if gravity is None else self._constant(np.zeros(self.grid.dim))
+            residual += 1 / scale * term_of(term, space.w, test, **arguments, **more)[0]
+        gravity_constant = None if gravity is None else self._constant(np.zeros(self.grid.dim))
         if self.fluid:
-            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets, pull)
-            flux -= sum(dt * form_of("sources", source, **seen, q=q, p=scale * p) for source in sources)
+            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets, gravity_constant)
+            flux -= sum(dt * form_of("sources", source, **arguments, q=q, p=scale * p) for source in sources)
             residual += around * content * dx + flux
             flux = _compat.compiled(flux)
         for plate, area in self._plates:
@@ -342,11 +342,11 @@ class BiotFEM:
             else:
                 dead.append(self._on(load, ufl.inner(value, v) / scale))
         if gravity is not None:
-            given.append((partial(self._acceleration, gravity), pull))
+            given.append((partial(self._acceleration, gravity), gravity_constant))
             solid = self._constant((1 - law.porosity) * law.grain_density)
-            dead.append(around * solid * ufl.inner(pull, v) / scale * dx)
+            dead.append(around * solid * ufl.inner(gravity_constant, v) / scale * dx)
             if self.fluid:
-                weight = self._constant(self.fluid.density) * self._held(J, p) * pull
+                weight = self._constant(self.fluid.density) * self._held(J, p) * gravity_constant
                 residual -= around * ufl.inner(weight, v) / scale * dx
         tangent = ufl.derivative(residual, space.w, ufl.TrialFunction(space.W))
         load = _compat.compiled(sum(dead)) if dead else None
@@ -401,16 +401,16 @@ class BiotFEM:
             x = self._places + u
             k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
         kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
-        back = self._in_plane(ufl.inv(F).T)
+        inverse = self._in_plane(ufl.inv(F).T)
         weight = None if pull is None else self._constant(self.fluid.density / self.scale) * pull
         if outlets is not None:
-            return content, self._two_point(kappa, F, back, p, q, outlets, weight)
+            return content, self._two_point(kappa, F, inverse, p, q, outlets, weight)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
-        drives = back * ufl.grad(mass_potential_form(p, compliance))
+        gradient = inverse * ufl.grad(mass_potential_form(p, compliance))
         if weight is not None:
-            drives -= ufl.exp(compliance * p) * weight
+            gradient -= ufl.exp(compliance * p) * weight
         kappa *= self._pores.of("relative_permeability", self._seen)
-        return content, self._around * kappa * J * ufl.inner(drives, back * ufl.grad(q)) * dx
+        return content, self._around * kappa * J * ufl.inner(gradient, inverse * ufl.grad(q)) * dx
 
     @property
     def _seen(self):
@@ -418,29 +418,29 @@ class BiotFEM:
         now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
         return self._whole * now + (1 - self._whole) * same
 
-    def _two_point(self, kappa, F, back, p, q, outlets: Sequence[Drained], weight):
+    def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL; weight: of fluid."""
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
-        stretch = ufl.det(F) * ufl.inner(back * normal, back * normal)
+        stretch = ufl.det(F) * ufl.inner(inverse * normal, inverse * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
         harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + TINY)
         around = self._around("+") if self.grid.axisymmetric else 1.0
-        way = across * self._in_plane(F) * normal
-        seen, drives = self._seen, ufl.jump(pi)
+        edge = across * self._in_plane(F) * normal
+        seen, difference = self._seen, ufl.jump(pi)
         if weight is not None:
-            fall = ufl.dot(weight("+"), (way("+") - way("-")) / 2)
-            drives += density_between(p("+"), p("-"), compliance) * fall
+            drop = ufl.dot(weight("+"), (edge("+") - edge("-")) / 2)
+            difference += density_between(p("+"), p("-"), compliance) * drop
         share = self._pores.between(seen("+"), seen("-")) * ufl.avg(stretch) / across("+")
-        flux = around * harmonic * share * drives * ufl.jump(q) * dS
+        flux = around * harmonic * share * difference * ufl.jump(q) * dS
         for o in outlets:
             outer = self._constant(o.pressure / self.scale)
-            drives = pi - self._constant(mass_potential(o.pressure, self.fluid.bulk) / self.scale)
+            difference = pi - self._constant(mass_potential(o.pressure, self.fluid.bulk) / self.scale)
             if weight is not None:
-                drives += density_between(p, outer, compliance) * ufl.dot(weight, way / 2)
-            flux += self._on(o, 2 * kappa * self._pores.between(seen, outer) * stretch / across * drives * q)
+                difference += density_between(p, outer, compliance) * ufl.dot(weight, edge / 2)
+            flux += self._on(o, 2 * kappa * self._pores.between(seen, outer) * stretch / across * difference * q)
         return flux
 
     def _solver(self) -> PETSc.SNES:
@@ -558,10 +558,10 @@ class BiotFEM:
             snes.solve(None, x)
             (first, last), _ = snes.getConvergenceHistory()
             norms.append(first)
-            asked = before - x.array_r[of_p]
-            taken = self._pores.reached(before, asked)
-            x.array_w[of_p] = before - taken
-            reached = self.grid.comm.allreduce(np.array_equal(taken, asked), op=MPI.LAND)
+            newton = before - x.array_r[of_p]
+            limited = self._pores.reached(before, newton)
+            x.array_w[of_p] = before - limited
+            reached = self.grid.comm.allreduce(np.array_equal(limited, newton), op=MPI.LAND)
             self._whole.value = float(reached and last < first)
             if reached and last <= max(absolute, relative * norms[0]):
                 reason = PETSc.SNES.ConvergedReason.CONVERGED_FNORM_RELATIVE
@@ -605,7 +605,7 @@ class BiotFEM:
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
-        result, began = Result(Rows([self._row(x)])), time.perf_counter()
+        result, start = Result(Rows([self._row(x)])), time.perf_counter()
         shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
         for _ in tqdm(range(steps), **shown):
             try:
@@ -614,7 +614,7 @@ class BiotFEM:
                 message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
                 raise GaveUp(message, result, failed.history) from failed
             result = result.after(Report(newton=newton, history=[(residual, 0.0)])).more(self._row(x))
-        return replace(result, wall=time.perf_counter() - began, converged=True)
+        return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, at reference positions x (m, d) in the body, on every process."""
@@ -637,9 +637,9 @@ class BiotFEM:
         out = np.zeros((len(x), size))
         x = x - self.grid.base
         cells = grid.local(grid.number(grid.index_from_base(x)))
-        here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
-        if len(here):
-            out[here] = f.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, size)
+        local = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
+        if len(local):
+            out[local] = f.eval(np.pad(x[local], ((0, 0), (0, 3 - grid.dim))), cells[local]).reshape(-1, size)
         return grid.comm.allreduce(out)
 
     def _row(self, x: NDArray[np.float64]) -> Row:

@@ -39,8 +39,8 @@ class _Rings:
         F = np.tile(np.eye(3), (len(stretches), 1, 1))
         F[:, 0, 0], F[:, 1, 1] = stretches.T
         cells = np.arange(len(F), dtype=np.int32) % 8
-        taken = {name: np.concatenate([v] * repeat) for name, v in (self._values | state).items()}
-        return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **taken)
+        inputs = {name: np.concatenate([v] * repeat) for name, v in (self._values | state).items()}
+        return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
 
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
         """Return the normal Kirchhoff stresses (n, 2), Pa; repeat: how often all rings are in the stretches."""

@@ -200,9 +200,9 @@ class _Point:
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
         """Return the point with several deformation gradients (m, 3, 3), and one state."""
         m, grid = len(F), self._law.grid
-        taken = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
+        inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
-        return self._law.points.at(cells, grid.midpoints[cells], np.ones(m), F=F, **taken)
+        return self._law.points.at(cells, grid.midpoints[cells], np.ones(m), F=F, **inputs)
 
     def _stress(
         self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]], dt: float = 0.0
@@ -262,8 +262,8 @@ class _Point:
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
         """Return the soil at another suction, Pa, with constant free components of the net stress."""
         m = self._material
-        felt, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
-        goal = [start.stress[i] + before - felt for i in free]
+        effective, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
+        goal = [start.stress[i] + before - effective for i in free]
         state = at.state | ({DRIED[0]: np.asarray(suction)} if DRIED[0] in at.state else {})
         return self._balanced(replace(at, state=state), at.F, free, goal, suction, dt)
 

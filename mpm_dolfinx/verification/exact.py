@@ -274,8 +274,8 @@ class SelfWeightColumn:
 
     def position(self, Y: ArrayLike) -> Array:
         """Return the heights (...), m, of points with reference Y (...), m, in [0, l0]. Source: integral of stretch."""
-        foot, w = self._shortening(0.0), self._shortening(Y)
-        return self.l0 * (foot - w) * (1 + (foot + w) / 2) / (foot * np.exp(foot))
+        base, w = self._shortening(0.0), self._shortening(Y)
+        return self.l0 * (base - w) * (1 + (base + w) / 2) / (base * np.exp(base))
 
     @property
     def height(self) -> float:
