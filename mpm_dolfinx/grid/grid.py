@@ -60,7 +60,7 @@ def in_chunks(count: int) -> list[slice]:
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the sums (..., size) of values (..., n) by index (n,); floats also for no values, unlike numpy's."""
     if values.ndim > 1:
-        rows = values.reshape(-1, len(index))
+        rows = values.reshape(int(np.prod(values.shape[:-1])), len(index))  # there may be none
         index, whole = (index + size * np.arange(len(rows))[:, None]).ravel(), size * len(rows)
         return sum_by(index, rows.ravel(), whole).reshape(*values.shape[:-1], size)
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
