@@ -81,7 +81,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from all columns (n, ...) by name and the outcomes (n).
+        """Return the rows with these columns, name -> values (n, ...), and these outcomes (n,).
 
         ValueError for missing or unknown columns, or different lengths.
         """

@@ -90,7 +90,7 @@ class Setting:
         return self.sides.grid
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of some classes by name."""
+        """Return the conditions of the given classes, by name."""
         return {name: one for name, one in self.conditions.items() if isinstance(one, kinds)}
 
 
@@ -315,7 +315,7 @@ class Acting:
         """Raise an error if the stage cannot begin at this position."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the initial history of n points for each condition, by name of the data."""
+        """Return the initial history of n points: condition -> name of the data -> values."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -193,7 +193,7 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return a matrix from rows of this process, with `columns` local columns; own: all entries are in these."""
+    """Return a matrix of this process's rows, with `columns` local columns; own: whether all entries are local."""
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]

@@ -6,9 +6,9 @@ bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the volume at rest),
 
-with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of the
-neighbours across faces that have the same material.  e is then corrected so that the pieces have the domain's volume at
-rest, int dV / det F.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
+with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of face
+neighbours of the same material. e is then corrected so that int dV / det F, summed over the pieces, is the domain's
+volume at rest.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations

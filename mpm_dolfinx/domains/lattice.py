@@ -8,8 +8,8 @@ grid is reset,
     d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
 with the displacement d of the corners since rest.  D_a is the third difference along axis a, over four corners in a
-row.  For rows of several widths it is the divided difference, with the same sum of absolute weights.  s is `FAST` times
-the number of cells that the corners have crossed, at most 1, so bodies nearly at rest are not filtered.  Quadratic
+row.  For rows of unequal widths it is the divided difference, scaled to the same sum of absolute weights. s is min(1,
+`FAST` c), with the number c of cells that the corners have crossed: bodies nearly at rest are not filtered.  Quadratic
 fields remain unchanged, also at the surface.  Along its axis a wave of two domains loses the fraction s, a wave of
 eight domains 0.003 s.  Domains that have separated from their neighbours are not filtered.  Nor is yielded soil: its
 deformation is irreversible, and its kinks are physical.  Corners held by a wall, a prescribed displacement, a plate or
@@ -39,7 +39,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 FAST = 10
 """Fraction of a wave of two domains that the filter removes, per crossed cell; at most 1.
 
-Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03.
+Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03 (relative changes of the result).
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
@@ -143,9 +143,9 @@ def _change(
     values : (m, k + 1)
         Values, and in the last column the number of crossed cells.
     tolerance : (k + 1,)
-        Tolerance: if rows of a site differ by more, its domains have separated and the site is left out.
+        Largest difference between rows of a site; above it the site's domains have separated and it is left out.
     thirds : (4, n - 3) along each axis
-        Weights of third differences along n corners, for rows of several widths, see `_divided`.
+        Weights of third differences along n corners, for rows of unequal widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across

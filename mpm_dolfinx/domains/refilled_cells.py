@@ -30,7 +30,7 @@ from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resamp
 GAP = 0.01
 """Largest gap, in cells, between faces of two domains that still form one surface.
 
-Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
+Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02 (relative changes of the result).
 """
 CRUMB = NEAR
 """Area, in cells, below which a part of a domain is dropped; its other parts take over its mass.  Source: as `NEAR`."""
@@ -40,7 +40,7 @@ SMALL = (0.5 / EDGES) ** 2
 Source: definition, half of an edge wide.
 """
 COVERED = 0.25
-"""Largest error of the pieces' area against that bounded by the surface, in cells.  Source: definition, one domain."""
+"""Largest difference between the pieces' area and a cell's filled area, in cells.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Face of a domain for each edge of the ring."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -48,10 +48,10 @@ START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 
 
 class Parts(NamedTuple):
-    """Parts of the surface in cells: rows (m,) of the faces, cell (m,), ends (m, 2, 2) in the cell, from 0 to 1.
+    """Parts of the surface in cells; row (m,): face; cell (m,); x (m, 2, 2): ends, in cell coordinates in [0, 1].
 
-    t : (m, 2) coordinates of the ends on the face, from 0 to 1; side : (m,) side of the cell if the part lies on it,
-    else -1.
+    t (m, 2): coordinates of the ends along the face, in [0, 1]; side (m,): side of the cell that contains the part, or
+    -1.
     """
 
     row: NDArray[np.int64]

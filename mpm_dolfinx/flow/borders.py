@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Borders of unsaturated soils with different conductivities: faces between cells, and mixed cells.
+"""Interfaces between unsaturated soils of different conductivity: faces between cells, and cells of several soils.
 
 Fluxes through these faces follow from `series`; all other faces have two-point fluxes in UFL.
 """

@@ -85,7 +85,7 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes that flow and run off where rain falls, before a first step."""
+        """Return the volumes of outflow, run-off and ponds before a first step: zero, or none without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
@@ -169,7 +169,7 @@ class OpenFaces:
 
 @dataclass(frozen=True)
 class UnsaturatedFaces(OpenFaces):
-    """Faces on open sides of unsaturated soil; conductance: at k_r = 1.
+    """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1.
 
     relative: conductivities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): outer
     potentials less the weight of the fluid up to them, Pa; outside (m,): outer pressures, Pa; drop (m,): that weight.

@@ -32,7 +32,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 INCLINED = 0.01
 """Slope of layers above which a cell's pressure moves to its most conductive part.
 
-Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03.
+Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03 (relative changes of the result).
 """
 PAIRS = 2**16
 """Pairs of pieces in a chunk."""
@@ -166,9 +166,9 @@ class MixedCells:
         Parameters
         ----------
         kappa, law
-            Of all pieces (m,): mobilities, m^2/(Pa s), of saturated soil, and numbers of their laws, below `laws`.
+            Mobilities (m,), m^2/(Pa s), of all pieces when saturated, and numbers of their laws, below `laws`.
         shift
-            Of the filled cells (n, d): from their centroids to their pressure positions, m; None for zero.
+            Vectors (n, d), m, from the filled cells' centroids to their pressures' positions; None if all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)

@@ -28,14 +28,14 @@ from mpm_dolfinx.grid.grid import sum_by
 ALONG = 1e-4
 """Offset along a face, in cells, below which two centroids count as opposite."""
 NEAREST = 0.1
-"""Least distance, in cells, for weights of the least squares.
+"""Lower bound of the distance, in cells, in the weights of the least-squares fit.
 
-Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03.
+Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03 (relative changes of the result).
 """
 SIDES = 2.0
-"""Total weight of a cell's open sides in its least squares, over the weight of a neighbour.
+"""Total weight of a cell's open sides in its least-squares fit, divided by the weight of a neighbour.
 
-Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03.
+Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03 (relative changes of the result).
 """
 
 

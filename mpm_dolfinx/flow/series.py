@@ -63,7 +63,7 @@ class Paths(NamedTuple):
 
 
 class Through(NamedTuple):
-    """Conductances (m,), m/(Pa s), and the slopes of the flux by the pressures on both sides."""
+    """Conductances (m,), m/(Pa s), and derivatives of the flux with respect to the pressures on both sides."""
 
     conductance: NDArray[np.float64]
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -80,7 +80,7 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Soils between nodes of m faces, flat: face, nodes, law, conductance, and drop by the fluid's weight, Pa."""
+    """Links, soils between two nodes of a face: face, nodes, law, conductance, hydrostatic pressure drop, Pa."""
 
     face: NDArray[np.int64]
     low: NDArray[np.int64]
@@ -91,7 +91,7 @@ class _Links(NamedTuple):
 
 
 class _Flows(NamedTuple):
-    """Conductances of links, slopes of their fluxes by the pressures at both nodes, fluxes, and their rounding."""
+    """Conductances of links; derivatives of the flux with respect to both nodes' pressures; fluxes; rounding errors."""
 
     k: NDArray[np.float64]
     own: NDArray[np.float64]

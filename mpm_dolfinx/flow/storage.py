@@ -20,9 +20,9 @@ therefore drift from their fluid content.  Points carry this volume defect, `owe
 it, `defect`, at a constant rate over the step.
 
 Q1 with DG0 violates the inf-sup condition for vanishing flow within a step: alternating pressures have no effect.  A
-stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with
-d = d+ + d- and the weight dt, s, of the rate at p.  A face then carries at least tau d A; with larger flow nothing is
-added.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil tau is a quarter of
+stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with d = d+ + d-
+and the weight dt, s, of the rate at p.  The coefficient dt kappa A / d of a face is thus raised to tau d A if it is
+smaller.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil tau is a quarter of
 Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in plastic flow needs up to a hundred times
 more.  The additional damping acts on second differences only (`second_differences`), because damped jumps would smear
 steep pressures.
@@ -61,7 +61,7 @@ from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
 FILTER = 0.75
 """Fraction of beta V that the filtered fixed-stress operator omits for checkerboard modes, in [0, 1].
 
-Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
+Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02 (relative changes of the result).
 """
 
 
@@ -99,8 +99,8 @@ class StorageForms:
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     symmetric
-        Whether to use alpha dJ_Delta as derivative of the content by J_Delta, for a symmetric Jacobian.  The neglected
-        term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
+        Whether alpha serves as the content's derivative with respect to J_Delta, for a symmetric Jacobian.  The
+        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
     flows
         Whether any material conducts; otherwise there are no fluxes.
     softens

@@ -34,7 +34,7 @@ MATCHES = {
 LEAST = 1e-20
 """Constant under the root of the squared deviatoric strain, which keeps its derivative finite.
 
-Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02.
+Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
 """
 
 

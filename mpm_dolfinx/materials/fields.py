@@ -36,12 +36,12 @@ WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Change of the state from rest at which a point counts as yielded.
 
-Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02.
+Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02 (relative changes of the result).
 """
 STIFFEST = 100.0
 """Upper limit of the stiffness of trapped pore fluid, in moduli of the skeleton; it limits rounding errors.
 
-Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02.
+Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02 (relative changes of the result).
 """
 
 

@@ -219,7 +219,7 @@ def stressed(
 ) -> MaterialPoints:
     """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); on all processes together.
 
-    In Modified Cam Clay the stress is a constant of the material; others get elastic strains, see `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter; elsewhere elastic strain causes it, see `_ElasticStrains`.
 
     Raises
     ------

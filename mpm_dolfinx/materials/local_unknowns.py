@@ -106,7 +106,7 @@ class LocalUnknowns:
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
     def update(self, data: PointData, derive: bool = True) -> None:
-        """Solve for the unknowns of points at their present F, and derive them; all processes together.
+        """Solve for the local unknowns of the points at their present F, and differentiate them; a collective call.
 
         derive: whether the next expression depends on `values`, not on `known` alone.
 
@@ -121,7 +121,7 @@ class LocalUnknowns:
             self.derive(data)
 
     def derive(self, data: PointData) -> None:
-        """Derive the last solution of the unknowns by F; all processes together."""
+        """Differentiate the last solution of the unknowns with respect to F; a collective call."""
         solved = self._at(data)
         self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
 
@@ -226,7 +226,7 @@ class _Equations:
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution of a law with `solution` in numpy."""
+        """Return the local unknowns of a law that has a numpy function `solution`."""
         n, k, values, start = *trial.shape, {}, 0
         for name, shape in self._trial.items():  # copies, because a law may change its arguments
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()

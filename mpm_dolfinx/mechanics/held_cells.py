@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides in the cells: a stiff penalty on the mean, a weak one on the deviation from it.
 
-A Q1 field has too few nodes in a cell to follow a side at many points. A stiff penalty at each of them would lock sides
-that are curved or inclined to the grid. The weak penalty controls the modes with zero mean in each cell. The present
-traction of the body, rotated with the side, is applied explicitly. Both penalties then carry the traction increment of
-the step only, and their gap is smaller by that factor.
+A Q1 field has too few nodal displacements in a cell to meet constraints at many points of a side. A stiff penalty at
+each of them would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero
+mean in each cell. The present traction of the body, rotated with the side, is applied explicitly. Both penalties then
+carry the traction increment of the step only, and their gap is smaller by that factor.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ALIGNED = 1e-2
 EVERYWHERE = 1e2
 """Normal penalty stiffness at each point of such a side, in units of (resisting modulus) / (cell size).
 
-Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02.
+Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02 (relative changes of the result).
 """
 TENSE = 10
 """Factor of the stress at a side in the penalty's modulus: a side held less stiffly than its stress buckles.
 
-Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02.
+Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02 (relative changes of the result).
 """
 CARRIED = 0.3  # traction increment of a step over resisting modulus and stress: larger ones are not physical
 
@@ -174,9 +174,9 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the rows (k,) with nodes at a wall, and others that also have rows without nodes at a wall.
+        """Return which rows (k,) have a node at a wall, and another node that a row without nodes at walls also has.
 
-        number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): nodes at the wall.
+        number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): flags of nodes at a wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)

@@ -51,7 +51,7 @@ GHOST_MASS = 0.02
 `tests/test_inertia.py` tests this.
 """
 RELAXES = 2.0
-"""Rate, per cell of corner motion, at which point velocities relax to grid velocities.
+"""Relaxation rate of point velocities towards grid velocities, per cell that the domain's corners have moved.
 
 It removes velocity modes of the points that the nodes cannot represent. In a test, a bar of 20 cells vibrates and flies
 over 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates of 0,

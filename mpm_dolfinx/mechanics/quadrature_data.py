@@ -220,7 +220,7 @@ class QuadraturePoints:
         return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data of the points that change from step to step."""
+        """Return the point data that change from step to step."""
         fields = {"F": points.F, **self._scene.state(points)}
         fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
         if self._extended:  # fields of laws are known for all materials; in `data` they are zero at points of others

@@ -47,7 +47,7 @@ The stability function is never below -0.21: an undetected jump overshoots by a 
 AGAIN = 2.0
 """Sudden change, relative to the previous step's at the same rate, up to which it does not count as a jump."""
 MOST = SAME / EPSILON
-"""Most output intervals. Source: exact bound, with more a step's slack SAME is below epsilon times the time."""
+"""Most output intervals. Source: exact bound; with more, the tolerance SAME of a step is below epsilon times t."""
 RESOLVED = 10
 """Smallest `rtol` in units of the solver's tolerance: smaller errors disappear in the solver's."""
 FIRST = 1e-3

@@ -34,10 +34,10 @@ OPTIONS = {
     "mg_levels_pc_type": "sor",
 }
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
-"""Smoothing for nearly incompressible bodies where factors may not replace the cycles.
+"""Smoother for nearly incompressible bodies where a direct solver must not replace multigrid.
 
-Two steps of a cube of 14^3 cells with layers of 1 : 1000 at nu = 0.49, without factors, take 126 iterations a solve (by
-GAMG 112); with a single sweep GMRES fails. With factors both take as long.
+Test without a direct solver: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. A solve takes 126
+iterations, by GAMG 112; with a single sweep GMRES fails. With a direct solver both smoothers take the same time.
 """
 MAYBE, NOT, IS = 0, 1, 2  # see `_shared`
 NONE = np.iinfo(np.int64).max

@@ -46,12 +46,12 @@ REBALANCED = 6  # total iterations with changing contacts, in units of the most 
 LOOSEST = 1e-2
 """Largest residual after a linear solve, relative to that before it.
 
-Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02.
+Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02 (relative changes of the result).
 """
 SOLVED = 0.05
 """Residual after the last linear solve, relative to the tolerance.
 
-Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02.
+Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02 (relative changes of the result).
 """
 SETTLED = 1e-2  # residual below which slipping contacts may stick: above it the contact area still changes
 ERROR = 1 / 20

@@ -34,8 +34,8 @@ class Thresholds:
         Most processes with which one holds the factors for many solves. Making both factors on all of four processes,
         which share the memory's bandwidth, took 1.7 times as long.
     fallback_3d
-        Most unknown displacements in 3D with which factors may replace cycles. MUMPS takes 8 s and 0.2 GB for this
-        number, with unsymmetric K 15 s and 0.4 GB.
+        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
+        and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
         Iterations of a solve after which factors replace the cycles, or the next tangent renews the factors of the
         fixed-stress operator. The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
@@ -56,19 +56,19 @@ THRESHOLDS = Thresholds()
 FORCING = 1e-5
 """Tightest relative tolerance of a linear solve.
 
-Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02.
+Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02 (relative changes of the result).
 """
 FORCING_3D = 1e-3
 """The same for multigrid in 3D."""
 KEEP = 0.05
 """Largest ratio of successive residuals at which the tangent is kept for the next step.
 
-Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02.
+Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
 """
 KEEP_WET = 0.01
 """The same in wet 2D scenes without yield.
 
-Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02.
+Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02 (relative changes of the result).
 """
 
 

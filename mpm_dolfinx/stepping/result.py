@@ -45,7 +45,7 @@ class Result:
     converged
         Whether the end has been reached.
     event
-        Number of the function of `until` that ended the run, from 0, and time, s; None without an event.
+        Index in `until`, from 0, of the function that ended the run, and its time, s; None if none did.
     points, memory, imbalance
         At the end of the run: material points, peak memory of all processes with libraries, MB, and the largest load of
         a process over the mean.
