@@ -7,7 +7,7 @@ bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the volume at rest),
 
 with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of face
-neighbours of the same material. e is then corrected so that int dV / det F, summed over the pieces, is the domain's
+neighbours of the same material.  e is then corrected so that int dV / det F, summed over the pieces, is the domain's
 volume at rest.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
 """
 
@@ -108,7 +108,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients` for elastic points (n,) of a cut; on all processes together."""
+        """Return `linear_gradients` for elastic points (n,) of a cut; a collective call."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils

@@ -8,7 +8,7 @@ grid is reset,
     d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
 with the displacement d of the corners since rest.  D_a is the third difference along axis a, over four corners in a
-row.  For rows of unequal widths it is the divided difference, scaled to the same sum of absolute weights. s is min(1,
+row.  For rows of unequal widths it is the divided difference, scaled to the same sum of absolute weights.  s is min(1,
 `FAST` c), with the number c of cells that the corners have crossed: bodies nearly at rest are not filtered.  Quadratic
 fields remain unchanged, also at the surface.  Along its axis a wave of two domains loses the fraction s, a wave of
 eight domains 0.003 s.  Domains that have separated from their neighbours are not filtered.  Nor is yielded soil: its

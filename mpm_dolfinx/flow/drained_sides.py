@@ -134,8 +134,8 @@ class DrainedSides(Feeding):
 class OpenFaces:
     """Faces on open sides with their conductances; arrays over m faces.
 
-    at (m,): index of the cell among the n active owned cells; conductance, inflow (m,): outflow per unit of the cell's
-    mass potential, m^d/(Pa s), and inflow, prescribed or by the outer pressure, m^d/s; seeps (m,): outflow only;
+    at (m,): index of the cell among the n active owned cells; conductance (m,): outflow per unit of the cell's mass
+    potential, m^d/(Pa s); inflow (m,): prescribed, or by the outer pressure, m^d/s; seeps (m,): face with outflow only;
     offset (m, d): vector from the cell's centroid, m.
     """
 
@@ -171,8 +171,8 @@ class OpenFaces:
 class UnsaturatedFaces(OpenFaces):
     """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1.
 
-    relative: conductivities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): outer
-    potentials less the weight of the fluid up to them, Pa; outside (m,): outer pressures, Pa; drop (m,): that weight.
+    relative: see `Relative`; cells (m,): cells behind them; normal (m, d): unit normals; outside (m,): outer pressures,
+    Pa; drop (m,): hydrostatic difference, centroid to face, Pa; outer (m,): mass potential at outside - drop.
     """
 
     relative: Relative
@@ -202,7 +202,7 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the cell's pressure, >= 0, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the cell's pressure, >= 0, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -245,7 +245,7 @@ class RainedFaces(OpenFaces):
         return self.pond.open_by(fluid)
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the cell's pressure, m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
@@ -262,7 +262,7 @@ class SideFeeds(Feeds):
     grid
         Background grid.
     names, ponds
-        Names of the conditions, by the numbers of the faces, and largest depths of ponds, m; None without rain.
+        Names and largest depths of ponds, m (None without rain), of the conditions, by the faces' numbers.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):

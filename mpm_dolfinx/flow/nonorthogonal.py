@@ -140,9 +140,9 @@ class Gradients:
         p : (c,), Pa
             Pressures of all local cells.
         outer : (m,), Pa
-            Beyond the open sides.
+            Pressures outside the open sides.
         weight : (d,), N/m^3
-            Of the fluid, None without gravity.
+            Unit weight of the fluid, None without gravity.
         """
         own, at = p[self._own], self._at[self._known]
         to_cells = p[self._neighbours] - own[:, None]
@@ -173,8 +173,8 @@ class Gradients:
 class NonorthogonalFlow(NamedTuple):
     """Non-orthogonal correction of the two-point fluxes.
 
-    forms, facets: over the faces of `nonorthogonal_facets`; gradients: of the cut; contents, sides: contents of the
-    cells, open sides; weight (d,), N/m^3: of the fluid, None without gravity.
+    forms, facets: forms over these faces, see `nonorthogonal_facets`; gradients: see `Gradients`; contents, sides:
+    contents of the cells, open sides; weight (d,): unit weight of the fluid, N/m^3, None without gravity.
     """
 
     forms: FluxForms
@@ -187,7 +187,7 @@ class NonorthogonalFlow(NamedTuple):
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the additional outflow (n,), m^d/s, of the filled cells to others, and corrections (m,), Pa.
 
-        The latter correct the cell pressure at open sides.  p : (c,), Pa; bulk: of the fluid, Pa.
+        The latter correct the cell pressure at open sides. p (c,): local pressures, Pa; bulk: fluid's bulk modulus, Pa.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active

@@ -56,7 +56,7 @@ class Sources(Feeding):
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return its derivative by the cell's pressure, m^d/(Pa s)."""
+        """Return its derivative with respect to the cell's pressure, m^d/(Pa s)."""
         return self._sum(self._slopes, pieces)
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:

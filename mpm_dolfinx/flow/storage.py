@@ -176,7 +176,7 @@ class StorageForms:
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return the derivatives of `change` by the pressure (filled cells,), m^d/Pa, and by nodal displacements.
+        """Return derivatives of `change` with respect to pressure (filled cells,), m^d/Pa, and nodal displacements.
 
         The latter (filled cells, n), m^(d-1), are derivatives of alpha dJ_Delta, for the momentum, then of the content
         if they differ.
@@ -194,7 +194,7 @@ class StorageForms:
     ) -> NDArray[np.float64]:
         """Return the outflow to other cells by p and the fluid's weight, m^d/s, of active cells, as a local array.
 
-        force (c, d): of inertia on the fluid in the local cells, N/m^3, or None.
+        force (c, d): inertia force on the fluid in the local cells, N/m^3, or None.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -210,8 +210,8 @@ class StorageForms:
 class Outflow:
     """Conductances of the active owned cells at present displacements.
 
-    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow per unit of the cell's potential to other cells,
-    m^d/(Pa s); mobility (n, d): along the axes, m^2/(Pa s); nonorthogonal: non-orthogonal correction, or None.
+    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow to other cells per unit of mass potential,
+    m^d/(Pa s); mobility (n, d): m^2/(Pa s); nonorthogonal: non-orthogonal correction, or None.
     """
 
     at: Sequence[Any]
@@ -224,7 +224,7 @@ class Outflow:
 class Rates:
     """Outflow rates of the owned cells, m^d/s, or with `integrated` outflow volumes, m^d.
 
-    cells: outflow less sources of each; net: outflow from the bodies less sources; turnover: sum of inflow and
+    cells: outflow of each cell less its sources; net: outflow from the bodies less sources; turnover: sum of inflow and
     outflow; gain: absolute value of sources.
     """
 
@@ -356,7 +356,7 @@ class StorageResidual:
     """Residual of the storage in each cell (m^d), and its scales in each part of the bodies (parts,), m^d.
 
     exchanged: sum of all changes; round_off: bound of rounding errors; off: sum of absolute mass errors of the cells;
-    gain: change, plus outflow, less sources; rates: at (u, p).
+    gain: change plus outflow less sources; rates: rates at (u, p).
     """
 
     vector: PETSc.Vec
@@ -385,7 +385,7 @@ class StorageProblem:
     dt
         Weight of the rate at (u, p), s.
     before
-        Outflow volumes by the rate of the substep before.
+        Outflow volumes from the rate of the previous substep.
     softness : (m,)
         Softness of the pieces, see `SoftnessAtPoints`, if the soil may soften.
     defect : (n,), m^d
@@ -447,7 +447,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the additional damping by the cells' softness (n,), for a damping tau (n,), 1/Pa, less the flow."""
+        """Return the additional damping, less the flow, of cells with softness (n,) and damping tau (n,), 1/Pa."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -505,7 +505,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content by pressure errors (n,), Pa, and its change in the step (n,)."""
+        """Return water-content errors due to pressure errors (n,), Pa, and the content's change in the step (n,)."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume

@@ -466,7 +466,7 @@ class SceneMaterials:
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together.
+        """Return the effective Cauchy stress (n, d, d), Pa, at the points; a collective call.
 
         In axisymmetry (n, 3, 3).
         """
@@ -476,14 +476,14 @@ class SceneMaterials:
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa, also out of plane; on all processes together."""
+        """Return the effective Cauchy stress (n, 3, 3), Pa, also out of plane; a collective call."""
         out = np.zeros((len(points), 3, 3))
         for law, rows, data in self._placed(points):
             out[rows] = law.stress_3d(data)
         return out
 
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; on all processes together.
+        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; a collective call.
 
         For laws without an energy it is Hencky's energy with constant moduli if `elastic_hencky`, else zero.
         """
@@ -500,7 +500,7 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
+        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; a collective call."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(

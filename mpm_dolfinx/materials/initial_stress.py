@@ -142,7 +142,7 @@ class InitialStresses:
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
-        """Return points with the elastic strains of their initial stress; on all processes together.
+        """Return points with the elastic strains of their initial stress; a collective call.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class InitialStresses:
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); on all processes together.
+    """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); a collective call.
 
     In Modified Cam Clay the initial stress is a parameter; elsewhere elastic strain causes it, see `_ElasticStrains`.
 

@@ -188,7 +188,7 @@ class _Equations:
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution at points with trial values (n, k); all processes together."""
+        """Return the solution at points with trial values (n, k); a collective call."""
         if self._law.residual is None:
             return self._in_numpy(data, trial)
         m, n = self.count, len(trial)
@@ -220,7 +220,7 @@ class _Equations:
         return Solved(data.key, y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged if a point on any process is lost, with the first such point; all processes together."""
+        """Raise NotConverged if a point on any process is lost, with the first such point; a collective call."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)

@@ -134,8 +134,9 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
     e : (n, 3)
         Strains, the largest first; the parameters (n,) follow.
 
-    Returns ------- Stresses (n, 3), their derivatives with respect to the strains (n, 3, 3), and 1 where there was
-    plastic flow (n,).
+    Returns
+    -------
+    Stresses (n, 3), their derivatives with respect to the strains (n, 3, 3), and 1 in plastic flow (n,).
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic

@@ -262,7 +262,7 @@ class HoldLoads(Loads):
     row : (m,)
         Row in `held` of each component.
     share : (m, 2^d)
-        Fraction of its force on each node, without the part that grid boundary conditions bear.
+        Fraction of each component's force on each node, without the part carried by grid boundary conditions.
     place
         Time and cut of the substep.
     """
@@ -371,7 +371,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding error of nodal forces, with the penalty's: stiffness times that of coordinates."""
+        """Return the rounding error of nodal forces, with the penalty's: stiffness times the error of coordinates."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

@@ -28,7 +28,7 @@ EVERYWHERE = 1e2
 Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02 (relative changes of the result).
 """
 TENSE = 10
-"""Factor of the stress at a side in the penalty's modulus: a side held less stiffly than its stress buckles.
+"""Factor of a side's stress in the penalty's modulus: a side with a penalty softer than its stress buckles.
 
 Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02 (relative changes of the result).
 """
@@ -38,11 +38,11 @@ CARRIED = 0.3  # traction increment of a step over resisting modulus and stress:
 class HeldPoints(NamedTuple):
     """Integration points on sides with prescribed displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x, gap : (n, d) position, and
-    prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
+    number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x : (n, d) position, m; gap : (n,
+    d) prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
     modulus, tension, resistance, firm : (n,) penalty modulus, norm of the stress at the last reset of the grid,
-    resisting modulus, and confined modulus, each times area, N.
-    normal : (n, d) area vector at the last reset, m^(d-1); force : (n, d) present force, rotated with the side, N.
+    resisting modulus, and confined modulus, each times area, N. normal : (n, d) area vector at the last reset, m^(d-1);
+    force : (n, d) present force, rotated with the side, N.
     """
 
     number: NDArray[np.int64]
@@ -72,13 +72,13 @@ class HeldCells:
     Attributes
     ----------
     number, cell, x, shape, moments
-        Of each row: condition, cell, mean position (m), mean shape functions, mean products of the offsets from the
-        cell's midpoint.
+        Condition, cell, mean position (m), mean shape functions, and mean products of the offsets from the cell's
+        midpoint, one for each row.
     stiffness, limit
-        By component: penalty stiffness, N/m, normal to a side along the grid with the confined modulus; and for means
-        the largest plausible force, N. Larger forces are artefacts.
+        Penalty stiffness of each component, N/m, with the confined modulus along the normal of a side along the grid;
+        for means, the largest plausible force, N. Larger forces are artefacts.
     way
-        Of each row: increment (d,) of the prescribed displacement in the step, m.
+        Increment (d,) of the prescribed displacement in the step, m, for each row.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):

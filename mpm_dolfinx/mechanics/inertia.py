@@ -46,7 +46,7 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass. A tenth and ten times of it change neither momentum nor energy of a turning block.
+"""Strength c of the ghost mass. With 0.002 and 0.2, momentum and energy of a turning block do not change.
 
 `tests/test_inertia.py` tests this.
 """
@@ -134,7 +134,7 @@ def moving(
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d); 2 x 2 ones take a tenth of numpy's time."""
+    """Return the inverses of matrices (n, d, d); for 2 x 2 matrices in a tenth of numpy's time."""
     if A.shape[1] > 2:
         return np.linalg.inv(A)
     (a, b), (c, e) = A.transpose(1, 2, 0)
@@ -278,7 +278,7 @@ class Mass:
     unknowns
         Unknown displacements.
     M, held
-        Mass matrices, kg, of the unknowns, and with rows for the displacements that grid boundary conditions fix.
+        Mass matrices, kg: of the unknowns, and with rows for displacements fixed by grid boundary conditions.
     """
 
     def __init__(
@@ -363,7 +363,7 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry without the circumferential one."""
+    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry without the circumferential component."""
     d = points.x.shape[1]
     return points.data[RATE] @ inverses(points.F[:, :d, :d])
 

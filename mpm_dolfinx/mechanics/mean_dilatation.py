@@ -98,7 +98,7 @@ class MeanDilatation:
         Fbar
             Its F-bar modification, see `fbar`.
         ratio
-            det Delta, of F over that at the start of the step.
+            det Delta, with Delta F_n = F.
         values
             UFL values of the law's parameters, state and local unknowns.
         known
@@ -120,7 +120,7 @@ class MeanDilatation:
         return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar) by F and by theta; for a law without an energy, of its work."""
+        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -129,7 +129,7 @@ class MeanDilatation:
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
     def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
-        """Return the derivatives by a pressure p, a UFL variable, of both that `_stress` gives."""
+        """Return the derivatives of both results of `_stress` with respect to a pressure p, a UFL variable."""
         return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
 
     def total(
@@ -139,7 +139,7 @@ class MeanDilatation:
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives by F and by theta of both results of `_stress`.
+        """Return the derivatives of both results of `_stress` with respect to F and theta.
 
         In the plane a law without an energy is differentiated by Fbar only, which takes half of the time. With Fbar = s
         F
@@ -236,7 +236,7 @@ def _dev(tau, F):
 
 
 class StressAtPoints:
-    """The stress P of a law and its derivative by theta at the points of a part, evaluated once for residual and pi.
+    """Stress P of a law, and its derivative by theta, at the points of a part: evaluated once for residual and pi.
 
     Parameters
     ----------

@@ -54,7 +54,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step; points of each part (`SceneMaterials.parts`); rows of each part in the former."""
+    """Integration points of a step; points of each part (`SceneMaterials.parts`); each part's rows among all points."""
 
     pieces: PointData
     parts: tuple[PointData, ...]
@@ -234,7 +234,7 @@ class QuadraturePoints:
         return fields
 
     def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return F, and a stretch across the plane if laws see one, at the pieces of this process's points."""
+        """Return F, and the out-of-plane stretch if laws take it, at the pieces of this process's points."""
         of_materials = self._scene.elastic(points), self._scene.soil_rows(points)
         if not self._scene.across:
             return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}

@@ -90,7 +90,7 @@ class StepSize:
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, fitted to the time left until the next output."""
+        """Return the length of the next step, s: `small`, adjusted to end a step at the output after `left`, s."""
         if self.by_error:  # no tiny step before an output
             small = min(small, self.longest)  # it may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)

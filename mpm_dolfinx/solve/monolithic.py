@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both linearised problems at once, where factors of K are too expensive: large bodies in 3D, larger ones in 2D.
+"""Both linearised problems at once, where a direct solver is too expensive: large bodies in 3D, larger ones in 2D.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
@@ -41,7 +41,7 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid, over the fluid volume that the residual forces would displace in a drained body.
+"""Smallest scale of the fluid / fluid volume that the residual forces would displace in a drained body.
 
 Sealed bodies exchange nearly no fluid: with scales that differ by 5e5 rounding left 2e-5 of a residual.
 """
@@ -68,7 +68,7 @@ class BlockOperator:
     scale
         Scales of the rows of both problems.
     slopes
-        Derivative of the fluxes by displacements, if it is included.
+        Derivative of the fluxes with respect to displacements, if it is included.
     """
 
     momentum: MomentumSystem
@@ -99,7 +99,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return the fluid volume that the residual forces displace in each part, over their norm (parts,), m^d/N."""
+        """Return (fluid volume displaced by the residual forces) / (their norm) of each part (parts,), m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -174,7 +174,7 @@ class BlockSolver:
         rtol
             Tolerance relative to the norm of both scaled residuals, in each part.
         slopes
-            Derivative of the fluxes by displacements, if it is included.
+            Derivative of the fluxes with respect to displacements, if it is included.
         factors
             Factors in place of the cycles so far.
 

@@ -70,7 +70,7 @@ def multigrid_solver(
     nodal
         Whether the unknowns belong to nodes.
     coarsest
-        Unknowns of a grid up to which factors solve on it.
+        Largest number of unknowns of a grid with a direct solver.
     firmly
         Whether to smooth three times as often: see `FIRMLY`.
     lines : (n,) along each axis, m

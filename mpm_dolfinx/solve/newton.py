@@ -13,8 +13,8 @@ A Newton step of the two problems reads
 fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: less beta V for pressures that alternate
 from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly
 unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: in turn, a storage solve
-with C + beta V at frozen stress, and a momentum solve. Where factors of K are too expensive, in large bodies, multigrid
-is used. `schur-...` then solve both problems at once, see `monolithic`.
+with C + beta V at frozen stress, and a momentum solve. Where a direct solver is too expensive, in large bodies,
+multigrid is used. `schur-...` then solve both problems at once, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ rise or oscillate, 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e lat
 step of a load that grows from zero, 0.26 e after a jump. The largest error of a run is thus 0.7 to 5 times this.
 """
 SUDDEN = np.sqrt(2)
-"""Change in the second substep over that in the first below which pressures decay so fast that sdirk2 overshoots.
+"""Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
 
 The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2), where the changes
 are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). Pressures that follow the loads have (1 - gamma) / gamma.
@@ -79,8 +79,8 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 class Errors:
     """Relative residuals of momentum and storage in the parts of the bodies; arrays (parts,).
 
-    u, p: relative residuals; forces: scale of the first, N; exchanged: scale of the second, the exchanged fluid volume,
-    m^d; start: forces at the start of the step, N; fluid: residual of the storage.
+    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, the exchanged fluid
+    volume, m^d; start: forces at the start of the step, N; fluid: residual of the storage.
     """
 
     u: NDArray[np.float64]
@@ -404,8 +404,8 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem; return the coupling iterations.
 
-        slow: whether the last step converged slowly with its own tangent, which lacks the derivative of fluxes by
-        displacements.
+        slow: whether the last step converged slowly with its own tangent, without the derivative of fluxes with respect
+        to displacements.
         """
         # no more accurate than the next residual needs
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
