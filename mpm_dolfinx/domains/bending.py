@@ -25,7 +25,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the Q1 displacement of corners and its quadratic correction (2, m, d), m.
+    """Return (2, m, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     Parameters
     ----------

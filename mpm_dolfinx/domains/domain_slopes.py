@@ -170,7 +170,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return slopes (d, k, k, r) of F by the coordinates xi of domains, and their inverse edges (d, d, r), 1/m."""
+    """Return derivatives (d, k, k, r) of F with respect to xi, and inverse edges (d, d, r) of domains, 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners, bits = cut.points.corners[rows].transpose(1, 2, 0).copy(), corner_bits(d)

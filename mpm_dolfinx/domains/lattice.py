@@ -238,7 +238,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed or fixed; walls: fixed components of each wall."""
+    """Return which components (n, 2^d, d) of corners are prescribed or fixed; walls: name -> its fixed components."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)

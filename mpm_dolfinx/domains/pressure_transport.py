@@ -36,10 +36,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class PiecePressures:
     """Pore pressure of a scene between two steps; arrays over the pieces of domains, ordered by point and cell.
 
-    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) of the domain;
-    x : (m, d), m, present position of the centroid.  For pieces that go to the next grid, else None:
-    pressure : (m,), Pa, at the centroid; slope : (m, d) of it, Pa/m; bounds : (m, 2), Pa, smallest and largest pressure
-    allowed in the piece.  For pieces that stay, else None: of_cell, start : (m,), Pa, of the cell now and at the reset.
+    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) fraction of the
+    domain; x : (m, d) present centroid, m.  For pieces that go to the next grid, else None: pressure : (m,) at the
+    centroid, Pa; slope : (m, d) its gradient, Pa/m; bounds : (m, 2) smallest and largest pressure allowed in the piece,
+    Pa.  For pieces that stay, else None: of_cell, start : (m,) pressure of the cell now and at the reset, Pa.
     """
 
     id: NDArray[np.int64]

@@ -35,7 +35,7 @@ Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02 (relative changes
 CRUMB = NEAR
 """Area, in cells, below which a part of a domain is dropped; its other parts take over its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Fraction of a cell: if less is left of a domain in a cell, this cell is renewed as well.
+"""Fraction of a cell's area: a cell with a smaller remainder of a domain is renewed as well.
 
 Source: definition, half of an edge wide.
 """
@@ -65,8 +65,8 @@ class Parts(NamedTuple):
 class OuterFaces:
     """Faces of domains (m,) on the surface.
 
-    point, face, key: point, number of the face, key of the face.  area, ends: length as seeded, m, and reference
-    positions of the ends (m, 2, 2), m, the lower one first.
+    point, face, key (m,): point, number and key of the face; area (m,): length as seeded, m; ends (m, 2, 2): reference
+    positions of the ends, m, the lower end first.
     """
 
     point: NDArray[np.int64]
@@ -101,9 +101,9 @@ class RefilledCells:
     Parameters
     ----------
     grid, points, body
-        Grid, points, and the body of each (n,).
+        Grid, points, and the body (n,) of each point.
     flowed, needs
-        Which points (n,) may be renewed, and which domains should be.
+        Which points (n,) may be renewed, and which domains (n,) need renewal.
     faces, signs
         Surface, and conditions on it, see `_signatures`.
     """
@@ -370,7 +370,7 @@ class RefilledCells:
 
     @cached_property
     def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """Remainders of removed domains outside the renewed cells, each piece a group; and these pieces."""
+        """Remainders of removed domains outside the renewed cells, one group per piece; and their pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
@@ -438,7 +438,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of removed domains, the group that receives each, and its fraction of its domain."""
+        """Pieces of removed domains; the group that receives each piece; the piece's fraction of its domain."""
         pieces = self.pieces
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, self.outside])
@@ -493,7 +493,7 @@ def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[n
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
     """Return domains (n, 4, 2) as convex polygons with face numbers of their edges, and the domain of each polygon.
 
-    volume (n,): of their cells, m^2.
+    volume (n,): volumes of their cells, m^2.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))

@@ -37,9 +37,9 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 class RenewedFaces:
     """Faces of renewed domains on surfaces (m,).
 
-    row : index of its seeded face among the faces of all these surfaces; at, face : index of the point, and number of
-    the face there; xi : (m, 2, 2) corners of the part of the face within the surface; area, m, and ends (m, 2, 2), m:
-    see `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
+    row : index of the seeded face among the faces of all these surfaces; at, face : index of the point, and number of
+    its face; xi : (m, 2, 2) corners of the part of the face within the surface; area, m, and ends (m, 2, 2), m: see
+    `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
     """
 
     row: NDArray[np.int64]

@@ -164,7 +164,7 @@ class LawAtPoints:
 def knows_space(grid: Grid, m: Skeleton) -> bool:
     """Return whether a material's law takes F (3, 3) in plane strain; a user-defined law may be for the plane only.
 
-    m: material with constants as arrays over one point.  For laws with local unknowns it is assumed.
+    m: material with constants as arrays over one point.  The result is True for laws with local unknowns.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -191,7 +191,7 @@ def by_scene(
 ) -> dict[str, Any]:
     """Return the arguments `BY_SCENE` of laws as UFL constants; the time must be set.
 
-    points: of the law; with cells of several sizes they carry their own cell size.
+    points: points of the law; on grids of several cell sizes they carry their cell size.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))

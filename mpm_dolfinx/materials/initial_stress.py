@@ -77,8 +77,8 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
     level
         Height, m, along the last axis.
     unit_weight
-        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside a scene 9810.  A warning appears if it
-        differs from that of the scene's fluid.
+        Unit weight of the fluid, N/m^3, > 0; by default of the scene's fluid, outside a scene 9810.  A warning appears
+        if it differs from the scene's fluid.
     """
     numbers("hydrostatic: level", level)
     if unit_weight is not None:
@@ -149,7 +149,7 @@ class InitialStresses:
         present
             Which bodies are present, for the overburden.
         gravity : (d,), m/s^2
-            None without.
+            Acceleration, or None.
         """
         if not self.given:
             return points
@@ -194,7 +194,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return overburden, Pa, height of the surface, m, and biot times pressure, Pa, of points, for K0."""
+        """Return, for K0, overburden, Pa, height of the surface, m, and biot times pore pressure, Pa, at the points."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -253,8 +253,8 @@ def stressed(
 class _ElasticStrains:
     """Elastic strains for target stresses, by Newton's method.
 
-    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa;
-    given, plastic : (n,) which points have the stress as a constant, and which have C_p^-1.
+    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1. points: n points; target (n, 3, 3): stress,
+    Pa; given (n,): whether the stress is a parameter; plastic (n,): whether the law has C_p^-1.
     """
 
     materials: SceneMaterials

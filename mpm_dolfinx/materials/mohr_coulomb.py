@@ -247,7 +247,7 @@ class _Return:
 
 
 def _inverse(A: NDArray) -> NDArray:
-    """Return the inverses of matrices (n, 2, 2), in a tenth of LAPACK's time."""
+    """Return the inverses of matrices (n, 2, 2); LAPACK takes ten times as long."""
     adjugate = A[:, ::-1, ::-1].transpose(0, 2, 1) * [[1, -1], [-1, 1]]
     return adjugate / (A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])[:, None, None]
 

@@ -58,7 +58,7 @@ class OfSuction:
             (self._locked if locks else self._free)[number] = CellSums([*along, *scalars], points)
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return cells (c,) and the derivatives (c, n), m^(d-1), of the forces on their nodes by their pressures."""
+        """Return cells (c,), and derivatives (c, n), m^(d-1), of nodal forces with respect to their pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

@@ -162,7 +162,7 @@ class MeanDilatation:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return the derivative by F of a component of tau, from its derivative C by Fbar."""
+            """Return the derivative of a component of tau with respect to F; C: derivative with respect to Fbar."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n

@@ -38,14 +38,13 @@ TANGLED = 0.2  # volume spanned by the corners over the domain's: below it corne
 class Pieces:
     """Particle domains cut by the cells; arrays over the pieces, ordered by point and cell.
 
-    point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
-    fraction : (m,) volume over the domain's volume; x : (m, d) centroid, m;
-    faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1);
-    mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2;
-    hoop : (m, 4) in axisymmetry, else (m, 0): of the section, offset (2,) of the centroid from the cell's midpoint, m;
-    mean product of the offset's components, m^2; radius of the centroid, m;
-    second : (m, d, d) on request, else (m, 0): second moments about the centroid over volume, m^2; in axisymmetry for
-    pieces that are symmetric in the plane.
+    point : (m,) index of the domain; cell : (m,) lexicographic number of the cell; fraction : (m,) fraction of the
+    domain's volume; x : (m, d) centroid, m; faces : (m, d, 2) area of the piece on the lower and upper face of its
+    cell, m^(d-1); mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other
+    axes, m^2; hoop : (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's
+    midpoint, m; mean product of its components, m^2; radius of this centroid, m; second : (m, d, d) on request, else
+    (m, 0): second moments about the centroid over volume, m^2; in axisymmetry for pieces that are symmetric in the
+    plane.
     """
 
     point: NDArray[np.int64]
@@ -534,8 +533,8 @@ def cut_faces(
 
     Returns
     -------
-    Of each point: its face, position (n, d), local coordinates (n, e), and fraction of the face; and the middle (n, d)
-    of the part of the face in its cell.
+    Face (n,), position (n, d), local coordinates (n, e) and fraction of the face (n,) of each point; middle (n, d) of
+    the part of the face in its cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -629,7 +628,7 @@ def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lengths or areas, up to a factor, of segments or triangles (k+1, e, m)."""
+    """Return lengths of segments, or areas of triangles, (k+1, e, m), up to a factor."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.sqrt((e[0] ** 2).sum(axis=0))

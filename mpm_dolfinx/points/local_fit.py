@@ -21,7 +21,7 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 RADIUS = 3.0
-"""Offset, over the spacing of the data, from which on the weight is zero.
+"""Offset, in spacings of the data, from which on the weight is zero.
 
 Source: exact, at an end of the data the points at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
 """

@@ -239,7 +239,7 @@ class MaterialPoints:
 
 
 _ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data"))
-"""Returns all arrays of points outside of `data`."""
+"""Function that returns all arrays of points except `data`."""
 
 
 class PlacedPoints(MaterialPoints):

@@ -51,7 +51,7 @@ class OfParts:
 
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Order of the entries by parts, first place of each part in it, and the parts with entries."""
+        """Order of the entries by parts, the index of each part's first entry, and the parts with entries."""
         sizes = np.bincount(self.of, minlength=self.count)
         present = sizes.nonzero()[0]
         return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present

@@ -61,7 +61,7 @@ class Polygons:
         return twice.sum(axis=1) / 2, np.einsum("nk,nki->ni", twice, y + after) / 6
 
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
-        """Return the part of each polygon with normal . x <= level; normal (n, 2), level (n,).
+        """Return the part of each polygon where normal . x <= level; normal (n, 2), level (n,).
 
         The algorithm is that of Sutherland and Hodgman (1974). A new edge has no number.
         """
@@ -99,14 +99,14 @@ class Polygons:
         return _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Divide convex polygons into quadrilaterals, by diagonals with the largest smaller part.
+        """Divide convex polygons into quadrilaterals, by the diagonals that divide them most evenly.
 
         So no vertex and no direction is preferred.
 
         Returns
         -------
-        The polygon (m,) of each; its vertices (m, 4, 2), of a triangle with the middle of the longest edge; numbers
-        (m, 4) of its edges.
+        Polygon (m,), vertices (m, 4, 2) and edge numbers (m, 4) of each quadrilateral; a triangle also has the middle
+        of its longest edge as a vertex.
         """
         left, rows = self, np.arange(len(self.count))
         found = []

@@ -80,7 +80,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return regions (m,), corners (m, 4, 2) of new domains in them, and the faces (m, 4) on the surface."""
+        """Return region (m,) and corners (m, 4, 2) of each new domain, and which faces (m, 4) lie on the surface."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
