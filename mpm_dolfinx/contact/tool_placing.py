@@ -158,7 +158,7 @@ class Tools:
         return out
 
     def going(self, ways: Ways, end: float | None = None) -> Tools:
-        """Return the tools with their displacements by loads in a step; end: of a step with inertia, s."""
+        """Return the tools with their displacements by loads in a step; end: end of a step with inertia, s."""
         tools = copy(self)
         tools._ways, tools._end = ways, end
         return tools

@@ -62,7 +62,7 @@ def _polynomial(
 ) -> NDArray[np.float64]:
     """Return a multilinear vector field (d, m) at offsets y (d, m), m, from the midpoints of cells.
 
-    coefficients (d, k, cells): of the monomials in the order of `Grid.monomials`, without monomials of axis `without`.
+    coefficients (d, k, cells): factors of the monomials, ordered as in `Grid.monomials`, without axis `without`.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)

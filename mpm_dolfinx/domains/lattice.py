@@ -110,7 +110,7 @@ class Lattice:
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the change (m, 2^d, d), m, of the displacements d of the corners of domains by the filter.
+        """Return the filter's change (m, 2^d, d), m, of the displacements d of domain corners.
 
         d : (m, 2^d, d), m; crossed (m, 2^d): number of cells crossed since the grid reset.
         """
@@ -132,7 +132,7 @@ def _change(
     tolerance: NDArray[np.float64],
     thirds: Sequence[NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the change (m, k) of values on a lattice by the filter.
+    """Return the filter's change (m, k) of values on a lattice.
 
     The lattice is distributed over the processes in slabs across its first axis.
 
@@ -254,7 +254,7 @@ def given(
 def filtered(
     grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the change of the corners (n, 2^d, d), m, by the filter.
+    """Return the filter's change of the corners (n, 2^d, d), m.
 
     then: the points at the grid reset; free (n,): which points are filtered.
     """

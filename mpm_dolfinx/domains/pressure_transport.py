@@ -218,7 +218,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factors (n,) by which all rises (m,) in a cell stay between its low and high (n,)."""
+    """Return the largest factors (n,) with which all increments (m,) in a cell stay between its low and high (n,)."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -226,7 +226,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest difference, <= 0, and the largest, >= 0, to neighbours (n,), of differences (n, d, 2)."""
+    """Return the smallest (<= 0) and largest (>= 0) difference to neighbours (n,), from differences (n, d, 2)."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 

@@ -77,7 +77,7 @@ class OuterFaces:
 
 
 class New(NamedTuple):
-    """New domains: corners (n, 4, 2), m; group (n,) that shares received values; keys, lengths and ends of faces."""
+    """New domains: corners (n, 4, 2), m; group (n,) with common values; keys (parent), lengths and ends of faces."""
 
     corners: NDArray[np.float64]
     group: NDArray[np.int64]
@@ -470,7 +470,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return values of new domains (n, ...) on their faces: means over the old surface in their cell."""
+        """Return the values (n, ...) of new domains on their faces: means over the old surface in their cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]

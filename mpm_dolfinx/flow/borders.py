@@ -196,7 +196,7 @@ class BorderFaces:
 
 @dataclass(frozen=True)
 class BorderFlows:
-    """Fluxes through such faces: pair (2, m): local cells; flux (m,), m^d/s; slopes by both pressures (m,)."""
+    """Fluxes through such faces; pair (2, m): local cells; flux (m,): m^d/s; slopes (m,): derivatives by pressure."""
 
     pair: NDArray[np.int64]
     flux: NDArray[np.float64]

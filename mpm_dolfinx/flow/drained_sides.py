@@ -327,7 +327,7 @@ class SideFeeds(Feeds):
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells; the non-orthogonal correction is that of the start of the substep."""
+        """Return the outflow of the cells; the non-orthogonal correction is taken at the start of the substep."""
         flux, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)

@@ -429,7 +429,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return the slope of T by k_r of a law, without squares of conductivities, which would vanish."""
+                    """Return dT / dk_r of a law, without squares of conductivities, which would vanish."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )

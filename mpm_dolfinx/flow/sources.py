@@ -89,5 +89,5 @@ class SourceFeeds(Feeds):
         return Leaving(-gain, gain=np.abs(gain))
 
     def slope(self, at: None, fluid: Fluid) -> NDArray[np.float64]:
-        """Return minus its derivative."""
+        """Return minus the derivative of the inflow."""
         return -self._sources.slope(self._pieces)[self._cells]

@@ -300,7 +300,7 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set the change of the residual by displacements u, m^d: of the content and, with slopes, of the fluxes."""
+        """Set the change of the residual by displacements u, m^d: changes of content and, with slopes, of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)

@@ -153,7 +153,7 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return k_r of the cell on a side of a face, as UFL of k_r of each retention curve."""
+        """Return k_r of the cell on one side of a face, as a UFL function of each retention curve's k_r."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:

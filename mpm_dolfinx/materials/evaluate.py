@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube as large as a cell, m; with several sizes of the largest cell."""
+    """Return the edge of a square or cube as large as a cell, m; on grids of several sizes, as the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -214,7 +214,7 @@ Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02 (relative changes
 
 
 class SoftnessAtPoints:
-    """Softness of yielding points: elastic over tangent shear modulus, along the strain of the last step.
+    """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
 
     Volume changes that alternate from cell to cell grow with the strain.  The balancing pressures are these volume
     changes over the damping strength tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau must then

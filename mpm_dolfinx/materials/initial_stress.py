@@ -34,7 +34,7 @@ class K0:
     """Initial effective stress of soil at rest under its own weight.
 
     The vertical stress is the overburden of soil and fluid plus the surcharge, less biot times the pore pressure.  The
-    horizontal stresses, radial and circumferential in axisymmetry, are K0 times that.  They are exact for level ground
+    horizontal stresses, radial and circumferential in axisymmetry, are K0 times this.  They are exact for level ground
     and layers; otherwise an equilibrium step follows, with a warning if it changes them by more than 5 %, as on slopes.
 
     Parameters

@@ -173,7 +173,7 @@ class Skeleton:
 
     @staticmethod
     def arguments_of(function: Callable | None) -> list[str]:
-        """Return the names of the arguments of one of the law's functions."""
+        """Return the argument names of one of the law's functions."""
         return [] if function is None else list(signature(function).parameters)
 
     def __post_init__(self):

@@ -425,7 +425,7 @@ class Inertia(Loads):
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns, m/s, at the start of a step and after a substep; its acceleration, m/s^2."""
+    """Velocities of the unknowns, m/s, at the start of a step and after a substep; last acceleration, m/s^2."""
 
     start: PETSc.Vec
     velocity: PETSc.Vec

@@ -106,8 +106,8 @@ class MeanDilatation:
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative by F (d, d, d,
-        d), Pa, for the tangent; and further sums of the tangent in each cell, for `assemble_matrix`.
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative with respect
+        to F (d, d, d, d), Pa, for the tangent; and further sums of the tangent in each cell, for `assemble_matrix`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         self._ratios.append(CellSums([ratio], points))
@@ -180,7 +180,7 @@ class MeanDilatation:
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f to the means of a quantity over the locking pieces of each cell; sums: its sums (cells, 1)."""
+        """Set f to the mean of a quantity over the locking pieces of each cell; sums (cells, 1): its sums."""
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 

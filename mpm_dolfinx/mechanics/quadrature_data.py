@@ -45,7 +45,7 @@ much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % t
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return the weight of the corner-based volume ratio at the start of a step in the cells of a material."""
+    """Return a material's weight of the corner-based volume ratio in cells at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)

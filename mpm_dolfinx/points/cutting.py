@@ -29,7 +29,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
-"""Least volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
+"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut at a time, for the processor's cache
 TANGLED = 0.2  # volume spanned by the corners over the domain's: below it corners are re-initialised from F
 
@@ -43,7 +43,7 @@ class Pieces:
     cell, m^(d-1); mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other
     axes, m^2; hoop : (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's
     midpoint, m; mean product of its components, m^2; radius of this centroid, m; second : (m, d, d) on request, else
-    (m, 0): second moments about the centroid over volume, m^2; in axisymmetry for pieces that are symmetric in the
+    (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces that are symmetric in the
     plane.
     """
 
@@ -63,7 +63,7 @@ def corner_bits(dim: int) -> NDArray[np.int64]:
 
 
 def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the corners (2d, 2^(d-1)) of the faces of a domain; face 2 a + e is the one at end e of axis a."""
+    """Return the corners (2d, 2^(d-1)) of a domain's faces; face 2 a + e is at end e of axis a."""
     bits = corner_bits(dim)
     return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
@@ -365,7 +365,7 @@ def _sum(
 
     @cache
     def pair(a: int, b: int) -> NDArray[np.float64]:
-        """Return the sums of products of two coordinates over the vertices of the slices."""
+        """Return the products of two coordinates, summed over the vertices of the slices."""
         return (x[:, a] * x[:, b]).sum(axis=0)
 
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
@@ -435,7 +435,7 @@ def _sum(
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return second moments over volume (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
+    """Return (second moments) / volume (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
 
     rings: whether the domains are sections of rings, in axisymmetry.
     """
@@ -445,10 +445,10 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return second moments over volume (n, 2, 2), m^2, of rings about their centroids, from symmetric sections.
+    """Return (second moments) / volume (n, 2, 2), m^2, of rings about their centroids, from symmetric sections.
 
-    spread (n, 2, 2), m^2, and radius (n,), m, belong to the sections and their centroids; spread[:, 0] / radius is the
-    vector from there to the centroid of the ring.
+    spread (n, 2, 2): second moments of the sections, m^2; radius (n,): radius of their centroids, m; spread[:, 0] /
+    radius is the vector from the section's centroid to the ring's centroid.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -481,7 +481,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals of products of two coordinates over the pieces of slots, from the corners of their cells.
+    """Return the integrals, over the pieces of slots, of products of two coordinates from the corners of their cells.
 
     Parameters
     ----------
@@ -496,7 +496,7 @@ def _products(
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return the integrals over the slices of a product of up to three coordinates."""
+        """Return the integrals of a product of up to three coordinates over the slices."""
         if not factors:
             return area
         if len(factors) == 1:

@@ -28,8 +28,8 @@ class PoreWater:
     """Water storage of m pieces in n cells.
 
     saturation: function of pressures (m,), Pa, returns S, its slope (m,), 1/Pa, and maybe more; slot (m,): cell of each
-    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: of the fluid, Pa; scale (n,): suction at which pores of a cell
-    drain, Pa.
+    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: fluid's bulk modulus, Pa; scale (n,): suction at which pores of a
+    cell drain, Pa.
     """
 
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]

@@ -40,7 +40,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan of problems with these matrices; symmetric: whether the momentum's tangent is."""
+    """Return the solver plan of problems with these matrices; symmetric: whether K is symmetric."""
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
