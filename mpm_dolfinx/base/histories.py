@@ -20,7 +20,7 @@ def _none(*shape: int) -> NDArray[np.float64]:
 class Row(NamedTuple):
     """Quantities at one output time.  Arrays are empty for quantities that were not requested, or without fluid.
 
-    t: s; displacement, position (m, d): of the m probes, m; pressure (2,): minimum and maximum on the points, Pa;
+    t: time, s; displacement, position (m, d): values at the probes, m; pressure (2,): extremes on the points, Pa;
     probe_pressure (m,), probe_stress (m, 3, 3): pore pressure and effective stress (tension positive) at the probes,
     Pa, see `probe_fields`; outcome: effects of the conditions on the bodies, see `State`.
     """

@@ -97,9 +97,9 @@ class Setting:
 class Place(NamedTuple):
     """Place and time of a condition in a substep.
 
-    cut, points: cut particle domains, and present points; pieces: their quadrature points, see `QuadratureData`; start,
-    dt: start and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether
-    the bodies have inertia.
+    cut: cut particle domains; points: present points; pieces: quadrature points, see `QuadratureData`; start, dt: start
+    and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether the bodies
+    have inertia.
     """
 
     cut: CutDomains

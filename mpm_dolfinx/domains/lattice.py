@@ -43,7 +43,7 @@ Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03 (relative chang
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
-"""Layers of the lattice on each side that influence the change of a layer."""
+"""Number of lattice layers on each side that influence the change of a layer."""
 
 
 class Lattice:
@@ -224,7 +224,7 @@ def _along(
 def lattices(
     bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
 ) -> list[Lattice]:
-    """Return the lattices of the present bodies; given: faces with prescribed components, and these components."""
+    """Return the lattices of the present bodies; given: pairs of prescribed faces and their prescribed components."""
     start = np.cumsum([0, *map(len, bodies)])
     around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
     out = []

@@ -38,7 +38,7 @@ class RenewedFaces:
     """Faces of renewed domains on surfaces (m,).
 
     row : index of the seeded face among the faces of all these surfaces; at, face : index of the point, and number of
-    its face; xi : (m, 2, 2) corners of the part of the face within the surface; area, m, and ends (m, 2, 2), m: see
+    its face; xi : (m, 2, 2) corners of the part of the face within the surface; area : (m,), ends : (m, 2, 2), m, see
     `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
     """
 

@@ -30,8 +30,8 @@ class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
     parallel (l,): mobilities, m^2/(Pa s), of lines with a single retention curve, weighted by their fraction of all
-    lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,), -1 for unused entries;
-    length (s,), fraction of the path; resistance (s,), length over mobility and fraction of lines, Pa s/m^2.
+    lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,): -1 for unused entries;
+    length (s,): fraction of the path; resistance (s,): length / (mobility x fraction of lines), Pa s/m^2.
     """
 
     parallel: NDArray[np.float64]

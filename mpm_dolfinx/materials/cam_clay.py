@@ -47,7 +47,7 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A number that follows from other constants."""
+    """A constant that follows from other constants."""
 
     follows = True
 

@@ -89,7 +89,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, N/m^3; by default that of the scene's fluid, outside a scene 9810."""
+    """A water pressure with a unit weight, N/m^3; default: unit weight of the scene's fluid, outside a scene 9810."""
 
     @property
     def unit_weight(self) -> float:
@@ -309,7 +309,7 @@ class _ElasticStrains:
         return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the strains (n, k) after a Newton step; missing: stress minus target, Pa.  Slopes are differences."""
+        """Return the strains (n, k) after a Newton step with finite differences; missing: stress minus target, Pa."""
         count = strain.shape[1]
         free = self.free
         (_, shear) = self.moduli()

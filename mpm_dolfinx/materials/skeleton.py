@@ -99,7 +99,7 @@ class Skeleton:
         NaN or infinity means that there is no solution, and cuts the step.  A law whose `energy` is not stationary in
         these unknowns takes many Newton steps, because second derivatives are missing.
     trial
-        Function (F, ...) -> {name: UFL}. Residuals depend on F through these trial values only; without `trial` they
+        Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
         take F itself.  Values other than UFL are passed to `kirchhoff` and `update` only, as `trial`.
 
     All these functions may take `dt`, the time since the start of the step, s, for rate-dependent laws.  The state at

@@ -21,7 +21,7 @@ from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side to a grid axis at which the cells can follow every point, even at constant volume."""
+"""Largest slope of a side relative to a grid axis at which cells can follow all its points, even at constant volume."""
 EVERYWHERE = 1e2
 """Normal penalty stiffness at each point of such a side, in units of (resisting modulus) / (cell size).
 
@@ -40,9 +40,9 @@ class HeldPoints(NamedTuple):
 
     number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x : (n, d) position, m; gap : (n,
     d) prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
-    modulus, tension, resistance, firm : (n,) penalty modulus, norm of the stress at the last reset of the grid,
-    resisting modulus, and confined modulus, each times area, N. normal : (n, d) area vector at the last reset, m^(d-1);
-    force : (n, d) present force, rotated with the side, N.
+    modulus, tension, resistance, firm : (n,) penalty modulus, stress norm at the last reset of the grid, resisting
+    modulus and confined modulus, all times area, N. normal : (n, d) area vector at the last reset, m^(d-1); force : (n,
+    d) present force, rotated with the side, N.
     """
 
     number: NDArray[np.int64]
@@ -147,8 +147,8 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), stiffness (k,), N/m, gaps (k,), m, and fractions (k, 2^d) of the forces on the nodes, without the
-        part of the wall; index of a row that must move but whose nodes are all fixed, or -1.
+        Rows (k,); their stiffness (k,), N/m; gaps (k,), m; fractions (k, 2^d) of the force on each node, without the
+        wall's part; index of a row that must move but has fixed nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))

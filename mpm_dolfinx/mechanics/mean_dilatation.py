@@ -90,13 +90,13 @@ class MeanDilatation:
         Parameters
         ----------
         law
-            Class of its law.
+            Class of the part's law.
         points
-            Its pieces, with the field F (d, d), the deformation gradient at the start of the step.
+            Pieces of the part, with the field F (d, d), the deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
-            Its F-bar modification, see `fbar`.
+            F-bar modification of F, see `fbar`.
         ratio
             det Delta, with Delta F_n = F.
         values

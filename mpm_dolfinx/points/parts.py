@@ -118,8 +118,8 @@ def _over_processes(
 ) -> tuple[NDArray[np.int64], int]:
     """Return the parts of cells over all processes, and their number.
 
-    own, count: part of each cell on this process, and number of these parts; nodes, of_node (n,): local numbers of the
-    nodes of the cells, and the part of each node.
+    own: part of each cell on this process; count: number of these parts; nodes (n,): local numbers of the cells' nodes;
+    of_node (n,): part of each node.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

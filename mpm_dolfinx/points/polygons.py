@@ -16,7 +16,7 @@ NONE = -1
 class Polygons:
     """Polygons (n,) of up to k vertices, anti-clockwise.
 
-    x : (n, k, 2), m, vertices, the last one repeated; count : (n,) number of vertices; edge : (n, k) number of the edge
+    x : (n, k, 2) vertices, m, padded by the last one; count : (n,) number of vertices; edge : (n, k) number of the edge
     from each vertex to the next, which cuts preserve.
     """
 

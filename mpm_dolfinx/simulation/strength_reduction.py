@@ -298,7 +298,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step over that of the shear stress, by magnitude.
+        """Return the work of the viscous stress in a step, divided by the work of the shear stress, by magnitude.
 
         Points that moved to another process are left out.
         """

@@ -6,8 +6,8 @@ first order. It is halved while a law cannot be evaluated at its end, or the res
 
 In yielding soil the step is full if the residual falls, or if the forces at its end do less than half of the initial
 work along it. Otherwise the search ends where they do about none (Matthies and Strang 1979). Points that the step
-unloads leave their yield surface there, and the next tangent is as stiff as they are. The work includes that of the
-fluid: the work of the forces alone nearly vanishes where these are in equilibrium and the fluid is not. Shorter steps
+unloads leave their yield surface there, and the next tangent is as stiff as they are. The work includes the fluid's
+work: the work of the forces alone nearly vanishes where these are in equilibrium and the fluid is not. Shorter steps
 with smaller residuals would lead to more short steps. Bracketed secants find the point. Soil that has lost its strength
 needs several: with one, a slumping bank takes twice the Newton steps.
 

@@ -92,7 +92,7 @@ class Errors:
 
     @cached_property
     def each(self) -> NDArray[np.float64]:
-        """The larger residual of each part."""
+        """The larger of both residuals of each part."""
         return np.maximum(self.u, self.p)
 
     @cached_property

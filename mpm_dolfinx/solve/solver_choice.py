@@ -59,7 +59,7 @@ FORCING = 1e-5
 Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02 (relative changes of the result).
 """
 FORCING_3D = 1e-3
-"""The same for multigrid in 3D."""
+"""Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
 """Largest ratio of successive residuals at which the tangent is kept for the next step.
 

@@ -219,7 +219,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the mean of Delta F over the pieces, with the mean of det.
 
-        Its shape is that of the laws' F.
+        It has the shape of the laws' F.
         """
         pieces = data.pieces
         grid = cut.grid

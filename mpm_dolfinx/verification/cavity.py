@@ -63,8 +63,8 @@ class _Rings:
 class Cavity:
     """A ring of soil in plane strain, with linear elements of one point each, under inner and outer pressure.
 
-    rings: the law; R, r: radii of the nodes at the start and now; state: of the law; far: pressure outside, Pa;
-    pressure: that in the hole, Pa.
+    rings: the law; R, r: radii of the nodes at the start and now, m; state: state of the law; far: outer pressure, Pa;
+    pressure: pressure in the hole, Pa.
     """
 
     rings: _Rings
