@@ -231,7 +231,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with the owners of the cells of corners or points, these cells, and the positions, m."""
+        """Exchange with the cells' owners, cells of corners or points, and positions, m."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim
@@ -256,7 +256,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) of positions in domains; if the domain has no piece there, of its largest piece."""
+        """Return the cells (m,) of positions in domains; where a domain has no piece, the cell of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

@@ -181,7 +181,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None = None,
     axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along axes, by default all; nan marks missing sites.
+    """Return a box (..., k) of values, filtered along axes (default: all); nan marks missing sites.
 
     Filters along two axes do not commute where s varies.  The mean over all orders of the axes makes the result
     independent of a rotation by a right angle.
@@ -209,7 +209,7 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along one axis; weights: see `_divided`, None for equal rows."""
+    """Return a box (..., k) of values, filtered along one axis; weights: see `_divided`, None for equal widths."""
     out, count = d.copy(), d.shape[axis]
     along, cells = out.swapaxes(axis, 0), crossed.swapaxes(axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)

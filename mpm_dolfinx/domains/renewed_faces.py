@@ -51,7 +51,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each position (n,); number: index among these faces, negative on a seeded face."""
+        """Return the face of each position (n,); number: index among the renewed faces, negative on a seeded face."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)

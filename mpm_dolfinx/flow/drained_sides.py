@@ -33,7 +33,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 THICK = np.sqrt(2)
-"""Largest section of a cube over its face.  Source: exact bound (Ball 1986).
+"""Largest section of a cube, divided by its face.  Source: exact bound (Ball 1986).
 
 The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face closer
 to the centroid of its cell's material, or behind it, bounds only a part of the material, and must not drain all of it.
@@ -212,7 +212,7 @@ class UnsaturatedFaces(OpenFaces):
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at the bounds.
+    """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at both bounds.
 
     The outflow is minus the rain, limited by the outflows at the bounds.  It includes seepage, so `seeps` is false.
     """
@@ -371,7 +371,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes of outflow through sides, of run-off, and of ponds, m^d."""
+        """Return the volumes of outflow through sides, run-off and ponds, m^d."""
         if not any(self._rains):
             return {}
         flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])

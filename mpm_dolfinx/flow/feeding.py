@@ -43,7 +43,7 @@ class Wet(NamedTuple):
 class Fluid(NamedTuple):
     """Fluid in the active owned cells: pressures p and mass potentials pi (n,), Pa; relative density (n,).
 
-    The density is relative to its value at zero pressure. force (n, d): inertia force, N/m^3, or None.
+    The density is relative to its value at zero pressure.  force (n, d): inertia force, N/m^3, or None.
     """
 
     p: NDArray[np.float64]

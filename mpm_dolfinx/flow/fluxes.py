@@ -39,7 +39,7 @@ class Mobility:
 
     mean (n,): mean of the pieces, m^2/(Pa s); share (n, d): mobility along each axis / mean; shift (n, d): vector, m,
     from the centroid to the position of the cell's pressure.  The last two are None without mixed cells.  In
-    unsaturated soil mean and share refer to saturated pores. shares (n, k): fractions of the mean from soil without a
+    unsaturated soil mean and share refer to saturated pores.  shares (n, k): fractions of the mean from soil without a
     retention curve and from each curve; paths: flow paths of mixed cells, see `series`; borders: faces between cells of
     different soil.
     """
@@ -315,7 +315,7 @@ class CellContents(Keyed):
         return self._shapes[:, :, -1]
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the indices of cells among the filled ones."""
+        """Return the indices of cells among the filled cells."""
         return self._slot[cells]
 
 

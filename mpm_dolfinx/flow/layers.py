@@ -30,7 +30,7 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""Slope of layers above which a cell's pressure moves to its most conductive part.
+"""Inclination of layers above which a cell's pressure position moves to its most conductive part.
 
 Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03 (relative changes of the result).
 """

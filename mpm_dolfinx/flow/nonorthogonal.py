@@ -26,7 +26,7 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import sum_by
 
 ALONG = 1e-4
-"""Offset along a face, in cells, below which two centroids count as opposite."""
+"""Offset along a face, in cells, below which two centroids are opposite each other."""
 NEAREST = 0.1
 """Lower bound of the distance, in cells, in the weights of the least-squares fit.
 
@@ -81,7 +81,7 @@ class Gradients:
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
         off[at[(np.abs(tangential / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
         self.rows = rows = np.flatnonzero(off)
-        """Indices of these cells among the filled ones."""
+        """Indices of these cells among the filled cells."""
         distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
         separation[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * distance
         self._own = contents.filled[rows]
@@ -187,7 +187,7 @@ class NonorthogonalFlow(NamedTuple):
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the additional outflow (n,), m^d/s, of the filled cells to others, and corrections (m,), Pa.
 
-        The latter correct the cell pressure at open sides. p (c,): local pressures, Pa; bulk: fluid's bulk modulus, Pa.
+        The latter correct the cell pressure at open sides; p (c,): local pressures, Pa; bulk: fluid's bulk modulus, Pa.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active

@@ -192,7 +192,7 @@ class StorageForms:
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow to other cells by p and the fluid's weight, m^d/s, of active cells, as a local array.
+        """Return the outflow of active cells to other cells, due to p and the fluid's weight, m^d/s, as a local array.
 
         force (c, d): inertia force on the fluid in the local cells, N/m^3, or None.
         """
@@ -393,7 +393,7 @@ class StorageProblem:
     inertial
         Function that returns the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
-        Suctions at which pores of these cells drain (n,), Pa, or None.
+        Suctions (n,), Pa, at which the pores of these cells drain, or None.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -562,8 +562,8 @@ class StorageProblem:
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
         """Return a function: change of the outflow volumes (n,), m^d, for a change of u along a vector, m.
 
-        It is a finite difference without a matrix (Knoll and Keyes 2004), of the conductivity laws and of the geometry
-        of the fluxes.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
+        It is a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the fluxes'
+        geometry.  `set_fluxes` resets the fluxes to u. dofs: active degrees of freedom of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -642,7 +642,7 @@ class StorageProblem:
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble C = d/dp and B = d/du of the residual at (u, p); data: other pieces than in the residual.
+        """Assemble the residual's derivatives C = d/dp and B = d/du at (u, p); data: other pieces than in the residual.
 
         of_suction: cells (c,), and derivatives of their nodal forces (c, n) by p through suction in laws, m^(d-1).
         """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in unsaturated soil: conductivities by the pressures on both sides of a face.
 
-The conductivity of a face is its mean over the pressures between the two sides (`retention.Conductance`).  The value of
-the wetter side would let a front run ahead.  With gravity this mean is `fitted`, so steady flow through exponential
-soil is exact.  For mixed cells see `series`.
+The conductivity of a face is its mean over the pressures between the two sides (`retention.Conductance`).  With the
+value of the wetter side a front would move too fast.  With gravity this mean is `fitted`, so steady flow through
+exponential soil is exact.  For mixed cells see `series`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     scale
         Characteristic suction of k_r, Pa.
     of
-        Functions for these arguments.
+        Functions for arguments of their type: numbers, arrays or UFL.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
@@ -188,8 +188,8 @@ class Relative:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k_r (m,) of owned cells along normals (m, d) between their pressures and others (m,), Pa.
 
-        Also return the derivative of k_r times the potential difference with respect to their pressures. drop (m,), Pa:
-        pressure drop by the fluid's weight out of the cells.
+        Also return the derivative of k_r times the potential difference with respect to these pressures; drop (m,):
+        pressure drop by the fluid's weight out of the cells, Pa.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

@@ -256,7 +256,7 @@ class BarcelonaBasic(ModifiedCamClay):
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, at which suction has no effect; usually a hundredth to a half of P_c0.
+        Stress P_r, Pa, > 0, at which suction has no effect; usually 0.01 to 0.5 times P_c0.
 
     Other parameters: see `ModifiedCamClay`.  In a scene with fluid `retention` must be given.  The state is that of
     Modified Cam Clay, with `consolidated` for P_c0, and `suction`, Pa.  Source: Alonso, Gens and Josa (1990); in

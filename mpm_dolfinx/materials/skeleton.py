@@ -28,7 +28,7 @@ BY_SCENE = ("dt", "cell_size")
 """Arguments of laws from the scene: time since the start of the step, s, and mean length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""States that the scene sets: suction max(-p, 0) at the end of a substep, and as seeded, Pa."""
+"""States that the scene sets: the suction max(-p, 0), Pa, at the end of a substep, and at seeding."""
 
 LOCKING = 0.43
 """Poisson's ratio above which cells use the mean dilatation, at twice the cost of a step.
@@ -376,7 +376,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; equal ones are separated by `separation`."""
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; `separation` separates equal eigenvalues."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2

@@ -84,7 +84,7 @@ class GhostPenalty:
     firmness
         Form of the elastic shear stiffness over whole cells, times their volume fraction: regularises tangents.
     fill, beside
-        Volume fraction of each cell, and the largest one among its neighbours.
+        Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """
 
     def __init__(self, grid: Grid, V: fem.FunctionSpace, at_points: bool):

@@ -295,8 +295,8 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces of cell means to their multipliers, on sides that lack a part of their way.
 
-        Such a body resists its side more stiffly than one cell of it would, as sealed water does.  The updates end if
-        the mean gap no longer falls by half: the cells cannot follow the side any further.
+        Such a body, for example sealed water, resists the side's motion more stiffly than one of its cells would.  The
+        updates end if the mean gap no longer falls by half: the cells cannot follow the side any further.
         """
         if not self._place.dt:
             return False

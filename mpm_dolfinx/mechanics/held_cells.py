@@ -196,8 +196,8 @@ class HeldCells:
         """Return the conditions whose force exceeds its limit, with the position (d,), m, of the largest excess.
 
         A Q1 field cannot always meet the means of two neighbouring cells, as for a side along a grid line. The
-        penalties then push it to and fro. Only their sum at the nodes acts on the body and counts in the reaction. A
-        row therefore exceeds its limit only if both its own force and the condition's nodal forces do.
+        penalties then push the side to and fro. Only their sum at the nodes acts on the body and counts in the
+        reaction. A row therefore exceeds its limit only if both its own force and the condition's nodal forces do.
 
         Parameters
         ----------

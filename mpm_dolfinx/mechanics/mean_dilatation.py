@@ -141,8 +141,8 @@ class MeanDilatation:
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In the plane a law without an energy is differentiated by Fbar only, which takes half of the time. With Fbar = s
-        F
+        In the plane a law without an energy is differentiated with respect to Fbar only, in half of the time. With Fbar
+        = s F
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 

@@ -73,7 +73,7 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Positions of the pieces of a cut, with rows and positions of each part.
+    """Positions of the pieces of a cut; rows and positions of the pieces of each part.
 
     lever (m, d), m: vectors to the pieces from the centroid of the material in their cell, once they are known.
     """

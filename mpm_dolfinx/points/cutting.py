@@ -341,7 +341,7 @@ def _sum(
     owner: NDArray[np.int64],
     second: bool,
 ) -> Pieces:
-    """Sum the slices of the surfaces by point and cell into pieces."""
+    """Sum the surfaces' slices to one piece for each point and cell."""
     d = grid.dim
     index = np.floor(s.sum(axis=0) / d)
     least = s.min(axis=0)
@@ -491,7 +491,7 @@ def _products(
         Vertices (d, d, m) of slices, their sums (d, m), and the areas (m,) of the slices, projected along the first
         axis.
     pair, total
-        Functions that sum products of two coordinates over the vertices of slices, and values of slices over slots.
+        Functions: sum of products of two coordinates over vertices of slices; sum of slices' values over slots.
     """
     d = len(x)
 

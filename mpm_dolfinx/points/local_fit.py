@@ -26,7 +26,7 @@ RADIUS = 3.0
 Source: exact, at an end of the data the points at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of the coefficients of each degree relative to the data: they matter only for undetermined coefficients.
+"""Weights of each degree's coefficients relative to the data; they only affect undetermined coefficients.
 
 Factors of 0.01 and 100 change the pressures of a consolidating column by 1e-5 of the load.
 """

@@ -33,7 +33,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a vector on this process, each with its part.
+    """Entries of a vector on this process, and the part of each entry.
 
     Parameters
     ----------

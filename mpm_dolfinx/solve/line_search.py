@@ -60,7 +60,7 @@ class Halving:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step at whose end the residuals do less than half of the initial work.
+    """Search for a step with less than half of the initial work of the residuals at its end.
 
     step: the next trial; low, high: steps between which the work changes its sign; at_low, at_high: work there /
     initial work; ends: whether the next step is the last one.

@@ -62,7 +62,7 @@ def multigrid_solver(
     A
         The matrix, which may still be empty.
     name
-        Prefix of its options.
+        Prefix of the solver's options.
     places : (n, d + 1)
         Rows of this process: indices along the axes of the grid, >= 0, and kind, >= 0. Kinds are not mixed.
     held : (m, d + 1)
@@ -186,7 +186,7 @@ def _shared(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers (n,) of coarse unknowns, NONE for others, and whether this process owns them (n,).
 
-    The process of least rank that asks for an unknown owns it. Keys are distributed over processes to find owners and
+    The lowest-ranked process that asks for an unknown owns it. Keys are distributed over processes to find owners and
     numbers.
 
     Parameters

@@ -164,7 +164,7 @@ def note_pressures(
 ) -> None:
     """Note pressure changes of a step in its report, and the estimated error of the step.
 
-    The difference between the step and one of first order is seconds (Q2 - Q1), a fluid volume. The fixed-stress
+    The difference between the step and a first-order step is seconds (Q2 - Q1), a fluid volume. The fixed-stress
     operator turns it into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996). Cells are
     weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
@@ -314,7 +314,7 @@ class Newton:
         """Refuse an unstable equilibrium: smaller steps find the path that leaves it.
 
         Its tangent has negative eigenvalues. The check is for dry bodies only, because water delays buckling. If a step
-        has kept its first tangent, the next step finds out.
+        has kept its first tangent, the next step makes the check.
         """
         if not negative_pivots(self._solvers.solve_u):
             return

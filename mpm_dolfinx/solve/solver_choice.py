@@ -40,7 +40,7 @@ class Thresholds:
         Iterations of a solve after which a direct solver replaces multigrid, or the next tangent renews the factors of
         the fixed-stress operator. The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
     coarsest
-        Unknowns of a grid up to which factors solve on it.
+        Largest number of unknowns of a grid with a direct solver.
     """
 
     multigrid_3d: int = 1500
@@ -95,7 +95,7 @@ class SolverPlan:
     many
         Iterations of a solve after which new factors are made: see `Thresholds`.
     coarsest
-        Unknowns of a grid up to which factors solve on it.
+        Largest number of unknowns of a grid with a direct solver.
     forcing
         Tightest relative tolerance of a linear solve; see `plan`.
     keep
