@@ -50,8 +50,7 @@ START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 class Parts(NamedTuple):
     """Parts of the surface in cells; row (m,): face; cell (m,); x (m, 2, 2): ends, in cell coordinates in [0, 1].
 
-    t (m, 2): coordinates of the ends along the face, in [0, 1]; side (m,): side of the cell that contains the part, or
-    -1.
+    t (m, 2): coordinates of the ends along the face, in [0, 1]; side (m,): side of the cell on which it lies, or -1.
     """
 
     row: NDArray[np.int64]

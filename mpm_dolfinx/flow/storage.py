@@ -563,7 +563,7 @@ class StorageProblem:
         """Return a function: change of the outflow volumes (n,), m^d, for a change of u along a vector, m.
 
         It is a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the fluxes'
-        geometry.  `set_fluxes` resets the fluxes to u. dofs: active degrees of freedom of u.
+        geometry.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density

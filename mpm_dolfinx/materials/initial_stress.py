@@ -253,7 +253,7 @@ def stressed(
 class _ElasticStrains:
     """Elastic strains for target stresses, by Newton's method.
 
-    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1. points: n points; target (n, 3, 3): stress,
+    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1; points: n points; target (n, 3, 3): stress,
     Pa; given (n,): whether the stress is a parameter; plastic (n,): whether the law has C_p^-1.
     """
 

@@ -7,7 +7,7 @@ round-off.  The forms contain
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
 with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress in y and F is then
-the consistent tangent, without unrolled iterations. y*, z* and Y are coefficients at the points.  A stress without a
+the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  A stress without a
 derivative uses y* alone.  The stress of a law with an energy is itself a derivative.  There y has a second-order term,
 and its coefficients also follow from f = 0.  A law may instead return y(z) and its derivative in numpy.
 """

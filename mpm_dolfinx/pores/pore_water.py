@@ -2,7 +2,7 @@
 """Pressures of cells from the pore water of their pieces, in unsaturated soil.
 
 The fluid content of a piece with storage s (m^d/Pa) and pore volume n, less its value at zero pressure, is c(p) = s
-pi(p) + n (S(p) - 1) rho(p). pi is the mass potential, rho the density relative to zero pressure.  A piece above or
+pi(p) + n (S(p) - 1) rho(p).  pi is the mass potential, rho the density relative to zero pressure.  A piece above or
 below its cell's centroid, or of another soil, has c(p + o) with its own S and offset o.
 """
 
