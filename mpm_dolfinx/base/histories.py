@@ -20,7 +20,7 @@ def _none(*shape: int) -> NDArray[np.float64]:
 class Row(NamedTuple):
     """Quantities at one output time.  Arrays are empty for quantities that were not requested, or without fluid.
 
-    t: s; displacement, position (m, d): of the m probes, m; pressure (2,): minimum and maximum on the points, Pa;
+    t: time, s; displacement, position (m, d): values at the probes, m; pressure (2,): extremes on the points, Pa;
     probe_pressure (m,), probe_stress (m, 3, 3): pore pressure and effective stress (tension positive) at the probes,
     Pa, see `probe_fields`; outcome: effects of the conditions on the bodies, see `State`.
     """
@@ -81,7 +81,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from all columns (n, ...) by name and the outcomes (n).
+        """Return the rows with these columns, name -> values (n, ...), and these outcomes (n,).
 
         ValueError for missing or unknown columns, or different lengths.
         """

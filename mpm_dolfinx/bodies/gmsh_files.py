@@ -25,7 +25,7 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""meshio's names of gmsh's element types, and numbers of nodes; second-order types in gmsh's order of edges."""
+"""meshio's names of gmsh's element types, and numbers of nodes; second-order types have gmsh's order of edge nodes."""
 
 
 class _Numbers:

@@ -134,7 +134,7 @@ class Polytopes:
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return cells (n, k) by type with vertices x (nodes, d), m, one type after the other."""
+        """Return the polytopes of all cells, type by type; x (nodes, d): positions, m; cells: type -> nodes (n, k)."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]

@@ -67,7 +67,7 @@ def from_mesh(
     cell_tags, facet_tags
         Tags of a dolfinx mesh; cell_tags also the name of a file's cell data that number parts and sides.
     names
-        Numbers of tags by name; other tags are named by their digits, such as "3".
+        Name -> number of its tag; a tag without a name is named by its number, such as "3".
     per_cell
         Desired points per grid cell and direction, >= 1; domains with an edge above 1.5 cells / per_cell are split.
     material

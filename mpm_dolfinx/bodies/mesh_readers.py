@@ -45,7 +45,7 @@ def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
     counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
     read, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
     if len(counts) > 1 and read != whole:
-        raise ValueError(f"{len(counts)} pieces of {whole} cells, but meshio reads {read}; must be one piece")
+        raise ValueError(f"{len(counts)} pieces of {whole} cells in all, but meshio reads {read}; must be one piece")
 
 
 def check_systems(mesh: meshio.Mesh) -> None:

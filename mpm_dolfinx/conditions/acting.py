@@ -90,16 +90,16 @@ class Setting:
         return self.sides.grid
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of some classes by name."""
+        """Return the conditions of the given classes, by name."""
         return {name: one for name, one in self.conditions.items() if isinstance(one, kinds)}
 
 
 class Place(NamedTuple):
     """Place and time of a condition in a substep.
 
-    cut, points: cut particle domains, and present points; pieces: their quadrature points, see `QuadratureData`; start,
-    dt: start and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether
-    the bodies have inertia.
+    cut: cut particle domains; points: present points; pieces: quadrature points, see `QuadratureData`; start, dt: start
+    and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether the bodies
+    have inertia.
     """
 
     cut: CutDomains
@@ -315,7 +315,7 @@ class Acting:
         """Raise an error if the stage cannot begin at this position."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the initial history of n points for each condition, by name of the data."""
+        """Return the initial history of n points: condition -> name of the data -> values."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -390,17 +390,17 @@ The error of the displacement is (change of traction in the step, except by rota
 It does not accumulate, because each step measures it from the prescribed position.  Multipliers remove it where a body
 resists much more stiffly, see `HoldLoads.augment`.
 
-Plateau (soil): halved 5.9e-05, doubled 2.0e-05, cells 3.0e-02.
+Plateau (soil): halved 5.9e-05, doubled 2.0e-05, cells 3.0e-02 (relative changes of the result).
 """
 WEAK = 8.0
 """Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).
 
-Plateau (soil): halved 5.0e-06, doubled 7.9e-06, cells 3.0e-02.
+Plateau (soil): halved 5.0e-06, doubled 7.9e-06, cells 3.0e-02 (relative changes of the result).
 """
 YIELDING = 0.1
 """Fraction of the elastic modulus for the penalty of laws with a state, because yielding soil is much softer.
 
-Plateau (soil): halved 6.5e-05, doubled 1.9e-05, cells 3.0e-02.
+Plateau (soil): halved 6.5e-05, doubled 1.9e-05, cells 3.0e-02 (relative changes of the result).
 """
 
 
@@ -490,8 +490,8 @@ class RigidPlate(Condition):
     Raises
     ------
     ValueError
-        The force is not finite.  From the scene or the step: no point has the side, or its faces are not connected or
-        not in one plane (define a plate with a region for each part).
+        The force is not finite.  Raised by the scene or the step: no points lie on the side, or its faces are not
+        connected or not coplanar (define one plate, with a region, for each part).
     """
 
     side: str

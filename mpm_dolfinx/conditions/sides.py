@@ -21,7 +21,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Sides:
-    """Finder of the faces of conditions; conditions on the same faces share one object.
+    """Finds the faces on which a condition acts; conditions on the same faces share one object.
 
     Parameters
     ----------

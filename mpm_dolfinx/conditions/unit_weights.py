@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure whose unit weight, if not given, is that of the pore fluid."""
+    """Return a water pressure; the pore fluid gives its unit weight if it has none."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 

@@ -94,7 +94,7 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
 
 
 def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
-    """Return the contacts among conditions."""
+    """Return the conditions that are contacts."""
     return [one for one in conditions if isinstance(one, Contact)]
 
 

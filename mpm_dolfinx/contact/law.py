@@ -80,12 +80,12 @@ class ContactState:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Contact at some displacement: of m pairs, and of k conditions.
+    """Contact of m pairs and k conditions at some displacement.
 
-    force (m, d): on the points, N; push (m,): pressure, Pa; stiff (m,): minus its derivative by the gap, Pa/m; pressure
-    (k,): mean pressure, Pa; sticks (k,): whether in contact and stick; trial, shear (k, d): traction in stick, and
-    actual traction, Pa; most (k,): shear strength, Pa; grip (k, d, d): minus derivative of the traction by slip, Pa/m;
-    rise (k, d): its derivative by pressure.
+    force (m, d): force on the points, N; push (m,): pressure, Pa; stiff (m,): -d push / d gap, Pa/m; pressure (k,):
+    mean pressure, Pa; sticks (k,): whether in contact and stick; trial, shear (k, d): traction in stick, and actual
+    traction, Pa; most (k,): shear strength, Pa; grip (k, d, d): -d traction / d slip, Pa/m; rise (k, d): d traction / d
+    pressure.
     """
 
     force: NDArray[np.float64]

@@ -38,15 +38,15 @@ from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 REACH = 2.0
-"""Cells: largest gap that may close in a step; steps with larger motion are rejected."""
+"""Largest gap, in cells, that may close in a step; steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Cells: larger gaps do not close before the next pair update."""
+"""Gap, in cells, above which faces do not touch before the next update of the pairs."""
 DEEP = 0.25
-"""Cells: deeper places are behind a thin body."""
+"""Penetration, in cells, above which a position is behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces are tried."""
 BESIDE = 0.6
-"""Cells: corners within this distance of points on the other surface follow the Q1 field."""
+"""Distance, in cells, from points on the other surface within which corners follow the Q1 field."""
 PLACES = 1 << 32
 """Upper bound of a process's quadrature points on a surface."""
 

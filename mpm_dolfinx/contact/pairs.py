@@ -30,9 +30,9 @@ from mpm_dolfinx.parallel.exchange import Exchange
 class Geometry(NamedTuple):
     """Geometry of m pairs at some w.
 
-    gap (m,): m, negative in penetration; n (m, d): its derivative by w, the outward unit normal of the other side;
-    curvature (m, d, d): second derivative, 1/m, None if zero; slip (m, d): in the step, m; arm (m, d): lever arm of
-    moments, m; shear (m, d): traction before the step, rotated with the tool, Pa.
+    gap (m,): gap, m, < 0 in penetration; n (m, d): d gap / dw, the outward unit normal of the other side; curvature (m,
+    d, d): second derivative, 1/m, None if zero; slip (m, d): slip in the step, m; arm (m, d): lever arm of moments, m;
+    shear (m, d): traction before the step, rotated with the tool, Pa.
     """
 
     gap: NDArray[np.float64]
@@ -47,9 +47,9 @@ class Geometry(NamedTuple):
 class Pairs:
     """m pairs in owned cells.
 
-    number, cell (m,): contact, local cell; area (m,): m^(d-1); resistance (m,): lower one of both sides, Pa, see
-    `conditions`; pressure, shear (m,), (m, d): of the points before the step, Pa; x (m, d): positions of the points in
-    the grid, m; sign (contacts,): sign of the forces on the points in the results.
+    number, cell (m,): contact, local cell; area (m,): m^(d-1); resistance (m,): lower value of both sides, Pa, see
+    `conditions`; pressure (m,), shear (m, d): tractions at the points before the step, Pa; x (m, d): positions of the
+    points in the grid, m; sign (contacts,): sign of the forces on the points in the results.
     """
 
     grid: Grid
@@ -193,7 +193,7 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return a matrix from rows of this process, with `columns` local columns; own: all entries are in these."""
+    """Return a matrix of this process's rows, with `columns` local columns; own: whether all entries are local."""
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]

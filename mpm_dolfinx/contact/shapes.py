@@ -283,7 +283,7 @@ class Distance:
     """A shape by a user's signed distance function, with derivatives by finite differences.
 
     size: cell size, m, the scale of increments; base (d,): origin of positions, m, because the function is evaluated at
-    true positions.  Increments are powers of two, so that they do not round true positions together.
+    true positions.  Increments are powers of two, so distinct positions do not round to the same value.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]

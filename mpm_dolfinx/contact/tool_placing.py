@@ -158,7 +158,7 @@ class Tools:
         return out
 
     def going(self, ways: Ways, end: float | None = None) -> Tools:
-        """Return the tools with their displacements by loads in a step; end: of a step with inertia, s."""
+        """Return the tools with their displacements by loads in a step; end: end of a step with inertia, s."""
         tools = copy(self)
         tools._ways, tools._end = ways, end
         return tools
@@ -308,7 +308,7 @@ class Tools:
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
         """Return which corners (n, 2^d, d) of domains touch tools at time t (s), and follow the Q1 field alone.
 
-        The tool would push back any further motion in the next step, which roughens the pressure.
+        The tool would reverse any further motion of these corners in the next step, and pressures would oscillate.
         """
         out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.least
         for tool in self.tools:

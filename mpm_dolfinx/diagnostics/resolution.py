@@ -166,7 +166,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is slender across an axis, with no wall or other body on either side."""
+    """Return whether a body is thin along an axis, with no wall or other body at its two faces across the axis."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

@@ -25,7 +25,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the Q1 displacement of corners and its quadratic correction (2, m, d), m.
+    """Return (2, m, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def _polynomial(
 ) -> NDArray[np.float64]:
     """Return a multilinear vector field (d, m) at offsets y (d, m), m, from the midpoints of cells.
 
-    coefficients (d, k, cells): of the monomials in the order of `Grid.monomials`, without monomials of axis `without`.
+    coefficients (d, k, cells): factors of the monomials, ordered as in `Grid.monomials`, without axis `without`.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)

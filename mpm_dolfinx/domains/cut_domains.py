@@ -22,7 +22,7 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, in cells, since the domains were cut; beyond it they are cut again.
+"""Largest motion of corners, in cells, since the domains were cut; with larger motion they are cut again.
 
 The reference is a cut in every step.  In a consolidating column of ten cells the pressures change by 7e-5 of the load,
 and the settlement by 3e-5 of itself.  Both errors are proportional to this number.
@@ -39,7 +39,7 @@ class Patches:
     faces
         Faces of the surface.
     face, at : (n,)
-        Index of the face among these, and of the material point.
+        Index of the face in `faces`, and index of the material point.
     cell : (n,)
         Lexicographic cell.
     x, xi : (n, d), m, -
@@ -119,11 +119,11 @@ class CutDomains(Keyed):
         self.cells, self.x = grid.local(self._exchange.send(self.pieces.cell)), self._exchange.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces in them."""
         self.mixed = self._exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
-        """Their mean products of offsets in 3D, see `Pieces`."""
+        """Mean products of offsets of the pieces in 3D, see `Pieces`."""
         self.second = self._exchange.send(self.pieces.second) if second else None
-        """Their mean products of all offsets (m, d, d), m^2, if `second`."""
+        """Mean products of all offsets of the pieces (m, d, d), m^2, if `second`."""
         self.hoop = self._exchange.send(self.pieces.hoop) if grid.axisymmetric else None
-        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
+        """Moments of the pieces in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return the largest motion of corners since the cut, in cells, for each of `count` parts (count,).
@@ -231,7 +231,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with the owners of the cells of corners or points, these cells, and the positions, m."""
+        """Exchange with the cells' owners, cells of corners or points, and positions, m."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim
@@ -256,7 +256,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) of positions in domains; if the domain has no piece there, of its largest piece."""
+        """Return the cells (m,) of positions in domains; where a domain has no piece, the cell of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

@@ -64,7 +64,7 @@ def _of_hexahedra(
 def cell_ratios(
     cut: CutDomains, points: MaterialPoints, share: NDArray[np.float64], flows: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
+    """Return the volume ratios (m,) of the cut's pieces at the start of a step.
 
     With mean dilatation the ratio of a cell is the volume of its domains by their corners over the volume at rest.
     It is independent of the path, and its variation within the cell does no work.  Ratios updated by increments alone

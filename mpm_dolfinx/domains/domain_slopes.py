@@ -6,9 +6,9 @@ bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the volume at rest),
 
-with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of the
-neighbours across faces that have the same material.  e is then corrected so that the pieces have the domain's volume at
-rest, int dV / det F.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
+with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of face
+neighbours of the same material.  e is then corrected so that int dV / det F, summed over the pieces, is the domain's
+volume at rest.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients` for elastic points (n,) of a cut; on all processes together."""
+        """Return `linear_gradients` for elastic points (n,) of a cut; a collective call."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils
@@ -170,7 +170,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return slopes (d, k, k, r) of F by the coordinates xi of domains, and their inverse edges (d, d, r), 1/m."""
+    """Return derivatives (d, k, k, r) of F with respect to xi, and inverse edges (d, d, r) of domains, 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners, bits = cut.points.corners[rows].transpose(1, 2, 0).copy(), corner_bits(d)

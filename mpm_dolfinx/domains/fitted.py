@@ -33,7 +33,7 @@ def fitted_at(
     Parameters
     ----------
     sizes
-        Numbers of points of all bodies of the scene.
+        Number of points of each body of the scene.
     id, xi : (m,), (m, d)
         Numbers of the points, and coordinates in their domains; the same on all processes.
     tensor

@@ -8,8 +8,8 @@ grid is reset,
     d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
 with the displacement d of the corners since rest.  D_a is the third difference along axis a, over four corners in a
-row.  For rows of several widths it is the divided difference, with the same sum of absolute weights.  s is `FAST` times
-the number of cells that the corners have crossed, at most 1, so bodies nearly at rest are not filtered.  Quadratic
+row.  For rows of unequal widths it is the divided difference, scaled to the same sum of absolute weights.  s is min(1,
+`FAST` c), with the number c of cells that the corners have crossed: bodies nearly at rest are not filtered.  Quadratic
 fields remain unchanged, also at the surface.  Along its axis a wave of two domains loses the fraction s, a wave of
 eight domains 0.003 s.  Domains that have separated from their neighbours are not filtered.  Nor is yielded soil: its
 deformation is irreversible, and its kinks are physical.  Corners held by a wall, a prescribed displacement, a plate or
@@ -39,11 +39,11 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 FAST = 10
 """Fraction of a wave of two domains that the filter removes, per crossed cell; at most 1.
 
-Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03.
+Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03 (relative changes of the result).
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
-"""Layers of the lattice on each side that influence the change of a layer."""
+"""Number of lattice layers on each side that influence the change of a layer."""
 
 
 class Lattice:
@@ -110,7 +110,7 @@ class Lattice:
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the change (m, 2^d, d), m, of the displacements d of the corners of domains by the filter.
+        """Return the filter's change (m, 2^d, d), m, of the displacements d of domain corners.
 
         d : (m, 2^d, d), m; crossed (m, 2^d): number of cells crossed since the grid reset.
         """
@@ -132,7 +132,7 @@ def _change(
     tolerance: NDArray[np.float64],
     thirds: Sequence[NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the change (m, k) of values on a lattice by the filter.
+    """Return the filter's change (m, k) of values on a lattice.
 
     The lattice is distributed over the processes in slabs across its first axis.
 
@@ -143,9 +143,9 @@ def _change(
     values : (m, k + 1)
         Values, and in the last column the number of crossed cells.
     tolerance : (k + 1,)
-        Tolerance: if rows of a site differ by more, its domains have separated and the site is left out.
+        Largest difference between rows of a site; above it the site's domains have separated and it is left out.
     thirds : (4, n - 3) along each axis
-        Weights of third differences along n corners, for rows of several widths, see `_divided`.
+        Weights of third differences along n corners, for rows of unequal widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -181,7 +181,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None = None,
     axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along axes, by default all; nan marks missing sites.
+    """Return a box (..., k) of values, filtered along axes (default: all); nan marks missing sites.
 
     Filters along two axes do not commute where s varies.  The mean over all orders of the axes makes the result
     independent of a rotation by a right angle.
@@ -209,7 +209,7 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along one axis; weights: see `_divided`, None for equal rows."""
+    """Return a box (..., k) of values, filtered along one axis; weights: see `_divided`, None for equal widths."""
     out, count = d.copy(), d.shape[axis]
     along, cells = out.swapaxes(axis, 0), crossed.swapaxes(axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
@@ -224,7 +224,7 @@ def _along(
 def lattices(
     bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
 ) -> list[Lattice]:
-    """Return the lattices of the present bodies; given: faces with prescribed components, and these components."""
+    """Return the lattices of the present bodies; given: pairs of prescribed faces and their prescribed components."""
     start = np.cumsum([0, *map(len, bodies)])
     around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
     out = []
@@ -238,7 +238,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed or fixed; walls: fixed components of each wall."""
+    """Return which components (n, 2^d, d) of corners are prescribed or fixed; walls: name -> its fixed components."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -254,7 +254,7 @@ def given(
 def filtered(
     grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the change of the corners (n, 2^d, d), m, by the filter.
+    """Return the filter's change of the corners (n, 2^d, d), m.
 
     then: the points at the grid reset; free (n,): which points are filtered.
     """

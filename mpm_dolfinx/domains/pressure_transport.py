@@ -36,10 +36,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class PiecePressures:
     """Pore pressure of a scene between two steps; arrays over the pieces of domains, ordered by point and cell.
 
-    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) of the domain;
-    x : (m, d), m, present position of the centroid.  For pieces that go to the next grid, else None:
-    pressure : (m,), Pa, at the centroid; slope : (m, d) of it, Pa/m; bounds : (m, 2), Pa, smallest and largest pressure
-    allowed in the piece.  For pieces that stay, else None: of_cell, start : (m,), Pa, of the cell now and at the reset.
+    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) fraction of the
+    domain; x : (m, d) present centroid, m.  For pieces that go to the next grid, else None: pressure : (m,) at the
+    centroid, Pa; slope : (m, d) its gradient, Pa/m; bounds : (m, 2) smallest and largest pressure allowed in the piece,
+    Pa.  For pieces that stay, else None: of_cell, start : (m,) pressure of the cell now and at the reset, Pa.
     """
 
     id: NDArray[np.int64]
@@ -218,7 +218,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factors (n,) by which all rises (m,) in a cell stay between its low and high (n,)."""
+    """Return the largest factors (n,) with which all increments (m,) in a cell stay between its low and high (n,)."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -226,7 +226,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest difference, <= 0, and the largest, >= 0, to neighbours (n,), of differences (n, d, 2)."""
+    """Return the smallest (<= 0) and largest (>= 0) difference to neighbours (n,), from differences (n, d, 2)."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 

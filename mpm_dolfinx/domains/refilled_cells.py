@@ -30,17 +30,17 @@ from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resamp
 GAP = 0.01
 """Largest gap, in cells, between faces of two domains that still form one surface.
 
-Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02.
+Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02 (relative changes of the result).
 """
 CRUMB = NEAR
 """Area, in cells, below which a part of a domain is dropped; its other parts take over its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Fraction of a cell: if less is left of a domain in a cell, this cell is renewed as well.
+"""Fraction of a cell's area: a cell with a smaller remainder of a domain is renewed as well.
 
 Source: definition, half of an edge wide.
 """
 COVERED = 0.25
-"""Largest error of the pieces' area against that bounded by the surface, in cells.  Source: definition, one domain."""
+"""Largest difference between the pieces' area and a cell's filled area, in cells.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Face of a domain for each edge of the ring."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -48,10 +48,9 @@ START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 
 
 class Parts(NamedTuple):
-    """Parts of the surface in cells: rows (m,) of the faces, cell (m,), ends (m, 2, 2) in the cell, from 0 to 1.
+    """Parts of the surface in cells; row (m,): face; cell (m,); x (m, 2, 2): ends, in cell coordinates in [0, 1].
 
-    t : (m, 2) coordinates of the ends on the face, from 0 to 1; side : (m,) side of the cell if the part lies on it,
-    else -1.
+    t (m, 2): coordinates of the ends along the face, in [0, 1]; side (m,): side of the cell on which it lies, or -1.
     """
 
     row: NDArray[np.int64]
@@ -65,8 +64,8 @@ class Parts(NamedTuple):
 class OuterFaces:
     """Faces of domains (m,) on the surface.
 
-    point, face, key: point, number of the face, key of the face.  area, ends: length as seeded, m, and reference
-    positions of the ends (m, 2, 2), m, the lower one first.
+    point, face, key (m,): point, number and key of the face; area (m,): length as seeded, m; ends (m, 2, 2): reference
+    positions of the ends, m, the lower end first.
     """
 
     point: NDArray[np.int64]
@@ -77,7 +76,7 @@ class OuterFaces:
 
 
 class New(NamedTuple):
-    """New domains: corners (n, 4, 2), m; group (n,) that shares received values; keys, lengths and ends of faces."""
+    """New domains: corners (n, 4, 2), m; group (n,) with common values; keys (parent), lengths and ends of faces."""
 
     corners: NDArray[np.float64]
     group: NDArray[np.int64]
@@ -101,9 +100,9 @@ class RefilledCells:
     Parameters
     ----------
     grid, points, body
-        Grid, points, and the body of each (n,).
+        Grid, points, and the body (n,) of each point.
     flowed, needs
-        Which points (n,) may be renewed, and which domains should be.
+        Which points (n,) may be renewed, and which domains (n,) need renewal.
     faces, signs
         Surface, and conditions on it, see `_signatures`.
     """
@@ -370,7 +369,7 @@ class RefilledCells:
 
     @cached_property
     def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """Remainders of removed domains outside the renewed cells, each piece a group; and these pieces."""
+        """Remainders of removed domains outside the renewed cells, one group per piece; and their pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
@@ -438,7 +437,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of removed domains, the group that receives each, and its fraction of its domain."""
+        """Pieces of removed domains; the group that receives each piece; the piece's fraction of its domain."""
         pieces = self.pieces
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, self.outside])
@@ -470,7 +469,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return values of new domains (n, ...) on their faces: means over the old surface in their cell."""
+        """Return the values (n, ...) of new domains on their faces: means over the old surface in their cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -493,7 +492,7 @@ def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[n
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
     """Return domains (n, 4, 2) as convex polygons with face numbers of their edges, and the domain of each polygon.
 
-    volume (n,): of their cells, m^2.
+    volume (n,): volumes of their cells, m^2.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))

@@ -37,9 +37,9 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 class RenewedFaces:
     """Faces of renewed domains on surfaces (m,).
 
-    row : index of its seeded face among the faces of all these surfaces; at, face : index of the point, and number of
-    the face there; xi : (m, 2, 2) corners of the part of the face within the surface; area, m, and ends (m, 2, 2), m:
-    see `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
+    row : index of the seeded face among the faces of all these surfaces; at, face : index of the point, and number of
+    its face; xi : (m, 2, 2) corners of the part of the face within the surface; area : (m,), ends : (m, 2, 2), m, see
+    `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
     """
 
     row: NDArray[np.int64]
@@ -51,7 +51,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each position (n,); number: index among these faces, negative on a seeded face."""
+        """Return the face of each position (n,); number: index among the renewed faces, negative on a seeded face."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)

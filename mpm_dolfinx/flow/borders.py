@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Borders of unsaturated soils with different conductivities: faces between cells, and mixed cells.
+"""Interfaces between unsaturated soils of different conductivity: faces between cells, and cells of several soils.
 
 Fluxes through these faces follow from `series`; all other faces have two-point fluxes in UFL.
 """
@@ -32,7 +32,7 @@ class Borders:
     contents
         Contents of the cells.
     cells, soils, law
-        Cells of pieces (m,), rows (m, k) that are equal for equal soil, and numbers of their retention curves.
+        Cell (m,) of each piece; rows (m, k), equal for equal soil; numbers (m,) of the pieces' retention curves.
     facets
         Faces of this process between two active cells.
     mixed
@@ -84,7 +84,7 @@ class Borders:
         contents, flow
             Contents of the cells, and conductivities of the filled owned cells.
         places, moved
-            Of the local cells (c, d), m: positions of their pressures from their midpoints, and displacements.
+            Vectors (c, d), m, of the local cells: from midpoint to pressure position, and displacement.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1
@@ -165,8 +165,8 @@ class Borders:
 class BorderFaces:
     """Faces between cells of different soil, with their conductivities.
 
-    borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,), m^(d-1); paths,
-    lengths, offsets: of both cells, see `through`, and vectors (m, d), m; weight (d,), N/m^3, bulk, Pa: of the fluid.
+    borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,): m^(d-1); paths,
+    lengths: see `through`; offsets: vectors (m, d), m; weight (d,), bulk: fluid's unit weight, N/m^3, and modulus, Pa.
     """
 
     borders: Borders
@@ -181,7 +181,7 @@ class BorderFaces:
     bulk: float
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at pressures (2, m) of the cells, Pa; force (c, d): of inertia on the fluid, N/m^3."""
+        """Return the fluxes at pressures (2, m) of the cells, Pa; force (c, d): its inertia force, N/m^3."""
         weight = (
             self.weight
             if force is None
@@ -196,7 +196,7 @@ class BorderFaces:
 
 @dataclass(frozen=True)
 class BorderFlows:
-    """Fluxes through such faces: pair (2, m): local cells; flux (m,), m^d/s; slopes by both pressures (m,)."""
+    """Fluxes through such faces; pair (2, m): local cells; flux (m,): m^d/s; slopes (m,): derivatives by pressure."""
 
     pair: NDArray[np.int64]
     flux: NDArray[np.float64]
@@ -208,7 +208,7 @@ class BorderFlows:
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the slopes of the outflows to a matrix; the caller finalises it."""
+        """Add the derivatives of the outflows to a matrix; the caller finalises it."""
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

@@ -33,7 +33,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 THICK = np.sqrt(2)
-"""Largest section of a cube over its face.  Source: exact bound (Ball 1986).
+"""Largest section of a cube, divided by its face.  Source: exact bound (Ball 1986).
 
 The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face closer
 to the centroid of its cell's material, or behind it, bounds only a part of the material, and must not drain all of it.
@@ -85,7 +85,7 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes that flow and run off where rain falls, before a first step."""
+        """Return the volumes of outflow, run-off and ponds before a first step: zero, or none without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
@@ -134,8 +134,8 @@ class DrainedSides(Feeding):
 class OpenFaces:
     """Faces on open sides with their conductances; arrays over m faces.
 
-    at (m,): index of the cell among the n active owned cells; conductance, inflow (m,): outflow per unit of the cell's
-    mass potential, m^d/(Pa s), and inflow, prescribed or by the outer pressure, m^d/s; seeps (m,): outflow only;
+    at (m,): index of the cell among the n active owned cells; conductance (m,): outflow per unit of the cell's mass
+    potential, m^d/(Pa s); inflow (m,): prescribed, or by the outer pressure, m^d/s; seeps (m,): face with outflow only;
     offset (m, d): vector from the cell's centroid, m.
     """
 
@@ -169,10 +169,10 @@ class OpenFaces:
 
 @dataclass(frozen=True)
 class UnsaturatedFaces(OpenFaces):
-    """Faces on open sides of unsaturated soil; conductance: at k_r = 1.
+    """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1.
 
-    relative: conductivities by pressures; cells (m,): behind the faces; normal (m, d): of the faces; outer (m,): outer
-    potentials less the weight of the fluid up to them, Pa; outside (m,): outer pressures, Pa; drop (m,): that weight.
+    relative: see `Relative`; cells (m,): cells behind them; normal (m, d): unit normals; outside (m,): outer pressures,
+    Pa; drop (m,): hydrostatic difference, centroid to face, Pa; outer (m,): mass potential at outside - drop.
     """
 
     relative: Relative
@@ -202,7 +202,7 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the cell's pressure, >= 0, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the cell's pressure, >= 0, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -212,7 +212,7 @@ class UnsaturatedFaces(OpenFaces):
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at the bounds.
+    """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at both bounds.
 
     The outflow is minus the rain, limited by the outflows at the bounds.  It includes seepage, so `seeps` is false.
     """
@@ -245,7 +245,7 @@ class RainedFaces(OpenFaces):
         return self.pond.open_by(fluid)
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the cell's pressure, m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
@@ -262,7 +262,7 @@ class SideFeeds(Feeds):
     grid
         Background grid.
     names, ponds
-        Names of the conditions, by the numbers of the faces, and largest depths of ponds, m; None without rain.
+        Names and largest depths of ponds, m (None without rain), of the conditions, by the faces' numbers.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -327,7 +327,7 @@ class SideFeeds(Feeds):
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells; the non-orthogonal correction is that of the start of the substep."""
+        """Return the outflow of the cells; the non-orthogonal correction is taken at the start of the substep."""
         flux, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
@@ -371,7 +371,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes of outflow through sides, of run-off, and of ponds, m^d."""
+        """Return the volumes of outflow through sides, run-off and ponds, m^d."""
         if not any(self._rains):
             return {}
         flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])

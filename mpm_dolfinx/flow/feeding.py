@@ -25,9 +25,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class Wet(NamedTuple):
     """Data of a substep for conditions on the fluid.
 
-    cut, points: cut domains, and points with the present positions; contents: of the cells; pieces: quadrature points,
-    None if only open sides are needed; t: end of the substep, s; drains: whether pores drain under suction; dt: length
-    of the step, s; outcome: of the step before.
+    cut: cut domains; points: points at present positions; contents: see `CellContents`; pieces: quadrature points, None
+    if only open sides are needed; t: end of the substep, s; drains: whether pores drain under suction; dt: length of
+    the step, s; outcome: outcome of the last step.
     """
 
     cut: CutDomains
@@ -43,7 +43,7 @@ class Wet(NamedTuple):
 class Fluid(NamedTuple):
     """Fluid in the active owned cells: pressures p and mass potentials pi (n,), Pa; relative density (n,).
 
-    The density is relative to zero pressure.  force (n, d), N/m^3: of inertia, None without.
+    The density is relative to its value at zero pressure.  force (n, d): inertia force, N/m^3, or None.
     """
 
     p: NDArray[np.float64]
@@ -87,7 +87,7 @@ class Feeds:
         raise NotImplementedError
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
-        """Return the derivative (n,) of the outflow by the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative (n,) of the outflow with respect to the cell's pressure, m^d/(Pa s)."""
         return 0.0
 
     def settle(self, at: Any, fluid: Fluid) -> int:
@@ -95,15 +95,15 @@ class Feeds:
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies by each condition, m^d/s, by name; all processes together."""
+        """Return the outflow from the bodies by each condition, m^d/s, by name; a collective call."""
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name; all processes together."""
+        """Return the rain that does not infiltrate, m^d/s, by name; a collective call."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates of a substep for `volumes`, by name; all processes together."""
+        """Return the rates of a substep for `volumes`, by name; a collective call."""
         return {}
 
     def volumes(
@@ -111,7 +111,7 @@ class Feeds:
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return volumes since the conditions began, m^d, by quantity and name, after a step.
 
-        rates, seconds: rates of its substeps, see `passing`, and their weights, s.
+        rates: rates in its substeps, see `passing`; seconds: time weights of these substeps, s.
         """
         return {}
 

@@ -37,10 +37,10 @@ ALONG = 0.1  # component of a unit normal: sides with less do not determine the 
 class Mobility:
     """Mobility of the filled owned cells.
 
-    mean (n,): of the pieces, m^2/(Pa s); share (n, d): mobility along each axis over the mean; shift (n, d): vector, m,
+    mean (n,): mean of the pieces, m^2/(Pa s); share (n, d): mobility along each axis / mean; shift (n, d): vector, m,
     from the centroid to the position of the cell's pressure.  The last two are None without mixed cells.  In
-    unsaturated soil mean and share refer to saturated pores.  shares (n, k): parts of the mean by soils without a
-    retention curve and by each retention curve; paths: of mixed cells, see `series`; borders: faces between cells of
+    unsaturated soil mean and share refer to saturated pores.  shares (n, k): fractions of the mean from soil without a
+    retention curve and from each curve; paths: flow paths of mixed cells, see `series`; borders: faces between cells of
     different soil.
     """
 
@@ -64,8 +64,8 @@ class CellMotion(NamedTuple):
 class Conduction:
     """Conductivity and motion of the filled owned cells.
 
-    motion: since the start of the step, at the centroids; None for bodies nearly at rest.  weight (d,): of the fluid,
-    N/m^3, None without gravity; bulk: its bulk modulus, Pa; relative: in unsaturated soil, see `unsaturated`.
+    motion: motion of the centroids in the step, None for bodies nearly at rest; weight (d,): unit weight of the fluid,
+    N/m^3, None without gravity; bulk: bulk modulus of the fluid, Pa; relative: see `unsaturated.Relative`.
     """
 
     mobility: Mobility
@@ -102,7 +102,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
-        """Return ratios (m,) of distances to faces, along normals (m, d): from centroids over from pressure positions.
+        """Return (distance of centroid) / (distance of pressure position) from faces (m,), along normals (m, d).
 
         offset (m, d): vectors from the centroids to the faces, m.
         """
@@ -121,10 +121,10 @@ class Conduction:
 class OpenSides:
     """Open sides of the bodies; arrays over m faces.
 
-    number (m,): of the condition; cells (m,): owned cell behind each face; shape: area over distance to the cell's
-    centroid, m^(d-2), zero for a prescribed inflow; pressure: outside, Pa; given: prescribed inflow, m^d/s; seeps:
-    outflow only; area (m, d): outward, m^(d-1); offset (m, d): vector from the cell's centroid, m; rain, driest (m,):
-    rain, m^d/s, and lowest outer pressure, Pa, nan without rain.
+    number (m,): condition; cells (m,): owned cell behind each face; shape: area / (distance to the cell's centroid),
+    m^(d-2), zero for a prescribed inflow; pressure: outer pressure, Pa; given: prescribed inflow, m^d/s; seeps: face
+    with outflow only; area (m, d): outward area vector, m^(d-1); offset (m, d): vector from the cell's centroid, m;
+    rain (m,): m^d/s; driest (m,): lowest outer pressure, Pa; both nan without rain.
     """
 
     number: NDArray[np.int64]
@@ -207,9 +207,9 @@ class OpenSides:
 class PieceContents:
     """Contributions of pieces to their owned cells; arrays over m pieces.
 
-    cells (m,); weight: volumes, m^d; area, x (m, d): volumes and centroids, m, in axisymmetry in the plane; faces
-    (m, d, 2): areas on the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa;
-    damping: the strength tau of the damping of pressure jumps, 1/Pa.
+    cells (m,); weight: volume, m^d; area, x (m, d): volume and centroid, m, in axisymmetry of the section; faces (m, d,
+    2): areas on the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa; damping: the
+    strength tau of the damping of pressure jumps, 1/Pa.
     """
 
     cells: NDArray[np.int32]
@@ -242,7 +242,7 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Of the pieces (m,): volume, m^d, and the same in axisymmetry in the plane, m^2."""
+        """Volumes (m,) of the pieces, m^d; in axisymmetry, areas (m,) of their sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), -1).T]))
@@ -264,7 +264,7 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active] = np.stack([lower[active], upper[active]], axis=2)
-        """Centroids (c, d) of the material in cells, from their midpoints, m; open fractions of faces (c, d, 2)."""
+        """Vectors (c, d), m, from cells' midpoints to their material's centroids; open fractions (c, d, 2) of faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
@@ -315,7 +315,7 @@ class CellContents(Keyed):
         return self._shapes[:, :, -1]
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the indices of cells among the filled ones."""
+        """Return the indices of cells among the filled cells."""
         return self._slot[cells]
 
 
@@ -429,7 +429,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return the slope of T by k_r of a law, without squares of conductivities, which would vanish."""
+                    """Return dT / dk_r of a law, without squares of conductivities, which would vanish."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )

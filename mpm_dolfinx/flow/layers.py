@@ -30,9 +30,9 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""Slope of layers above which a cell's pressure moves to its most conductive part.
+"""Inclination of layers above which a cell's pressure position moves to its most conductive part.
 
-Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03.
+Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03 (relative changes of the result).
 """
 PAIRS = 2**16
 """Pairs of pieces in a chunk."""
@@ -42,8 +42,8 @@ PAIRS = 2**16
 class Lines:
     """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a crossed piece.
 
-    line, piece: indices among the pieces of mixed cells; length: within the piece, cells; before: fraction of its
-    resistance between the lower end and the position of mean pressure; total: length of all lines, cells.
+    line, piece: indices among the pieces of mixed cells; length: length in the piece, cells; before: fraction of its
+    resistance between the lower end and the position of mean pressure; total: length of each whole line, cells.
     """
 
     line: NDArray[np.int64]
@@ -61,13 +61,13 @@ class MixedCells:
     rows
         Pieces (m,) in mixed cells, ordered by cell.
     cells
-        Their cells (m,).
+        Cells (m,) of the pieces.
     low, high
-        Their boxes (m, d) in the cell, whose edge is 1.
+        Corners (m, d) of the pieces' bounding boxes in the cell, whose edge is 1.
     x
-        Their centroids (m, d) in the cell.
+        Centroids (m, d) of the pieces in the cell.
     volume
-        Their volumes (m,), m^d.
+        Volumes (m,) of the pieces, m^d.
     contents
         Contents of the cells.
     soils
@@ -99,9 +99,9 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return lines of some pieces, the pieces that they cross, and the fraction crossed, for each axis.
+        """Return, for each axis, lines of some pieces, the pieces that they cross, and the fraction crossed.
 
-        first, count (m,): of the pieces in each piece's cell.
+        first, count (m,): index of the first piece, and number of pieces, in each piece's cell.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -122,8 +122,8 @@ class MixedCells:
     ) -> Mobility:
         """Return the mobility of all filled cells from their means (n,) and the mobilities of all pieces, m^2/(Pa s).
 
-        share (n, d): along the axes in cells that are not mixed, changed in place; now: of all pieces at their
-        pressures, in unsaturated soil.  The pressure is then at the centroid, unless layers are inclined.
+        share (n, d): mobility along the axes / mean, in unmixed cells, changed in place; now: mobilities of all pieces
+        at their pressures, in unsaturated soil.  The pressure is then at the centroid, unless layers are inclined.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -135,7 +135,7 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes, and shifts in cells, of mixed cells (n, d); kappa: of their pieces.
+        """Return mobilities along the axes, and shifts in cells, of mixed cells (n, d); kappa: pieces' mobilities.
 
         mean: 1 for shifts to the position of mean pressure, 0 for shifts by inclination alone.
         """
@@ -166,9 +166,9 @@ class MixedCells:
         Parameters
         ----------
         kappa, law
-            Of all pieces (m,): mobilities, m^2/(Pa s), of saturated soil, and numbers of their laws, below `laws`.
+            Mobilities (m,), m^2/(Pa s), of all pieces when saturated, and numbers of their laws, below `laws`.
         shift
-            Of the filled cells (n, d): from their centroids to their pressure positions, m; None for zero.
+            Vectors (n, d), m, from the filled cells' centroids to their pressures' positions; None if all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -238,7 +238,7 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobility along each axis over the mean (n, d), for a mobility that varies gradually in a cell.
+    """Return (mobility along each axis) / mean (n, d), for a mobility that varies gradually in a cell.
 
     Along its gradient the pieces are in series, across it in parallel.  For other directions the difference of the two
     means is distributed over the axes, by the variance of the linear variation along each.
@@ -246,7 +246,7 @@ def graded(
     Parameters
     ----------
     offset, kappa
-        Of the pieces: positions (m, d) from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
+        Positions (m, d) of the pieces from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
     mean
         Mean mobility of the filled cells (n,).
     """

@@ -26,16 +26,16 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import sum_by
 
 ALONG = 1e-4
-"""Offset along a face, in cells, below which two centroids count as opposite."""
+"""Offset along a face, in cells, below which two centroids are opposite each other."""
 NEAREST = 0.1
-"""Least distance, in cells, for weights of the least squares.
+"""Lower bound of the distance, in cells, in the weights of the least-squares fit.
 
-Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03.
+Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03 (relative changes of the result).
 """
 SIDES = 2.0
-"""Total weight of a cell's open sides in its least squares, over the weight of a neighbour.
+"""Total weight of a cell's open sides in its least-squares fit, divided by the weight of a neighbour.
 
-Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03.
+Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03 (relative changes of the result).
 """
 
 
@@ -81,7 +81,7 @@ class Gradients:
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
         off[at[(np.abs(tangential / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
         self.rows = rows = np.flatnonzero(off)
-        """Indices of these cells among the filled ones."""
+        """Indices of these cells among the filled cells."""
         distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
         separation[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * distance
         self._own = contents.filled[rows]
@@ -140,9 +140,9 @@ class Gradients:
         p : (c,), Pa
             Pressures of all local cells.
         outer : (m,), Pa
-            Beyond the open sides.
+            Pressures outside the open sides.
         weight : (d,), N/m^3
-            Of the fluid, None without gravity.
+            Unit weight of the fluid, None without gravity.
         """
         own, at = p[self._own], self._at[self._known]
         to_cells = p[self._neighbours] - own[:, None]
@@ -173,8 +173,8 @@ class Gradients:
 class NonorthogonalFlow(NamedTuple):
     """Non-orthogonal correction of the two-point fluxes.
 
-    forms, facets: over the faces of `nonorthogonal_facets`; gradients: of the cut; contents, sides: contents of the
-    cells, open sides; weight (d,), N/m^3: of the fluid, None without gravity.
+    forms, facets: forms over these faces, see `nonorthogonal_facets`; gradients: see `Gradients`; contents, sides:
+    contents of the cells, open sides; weight (d,): unit weight of the fluid, N/m^3, None without gravity.
     """
 
     forms: FluxForms
@@ -187,7 +187,7 @@ class NonorthogonalFlow(NamedTuple):
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the additional outflow (n,), m^d/s, of the filled cells to others, and corrections (m,), Pa.
 
-        The latter correct the cell pressure at open sides.  p : (c,), Pa; bulk: of the fluid, Pa.
+        The latter correct the cell pressure at open sides; p (c,): local pressures, Pa; bulk: fluid's bulk modulus, Pa.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active

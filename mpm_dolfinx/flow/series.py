@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-Soils lie in series between the pressure positions of two cells.  The pressures at the borders of soils are local
-unknowns of each face.  Newton's method finds them from the continuity of the flux, and they are condensed.  Each soil
-conducts like a pair of cells with this soil alone (`fitted`).  Steady flow through layers of exponential soil is
-therefore exact at any offset from the grid.
+Soils lie in series between the pressure positions of two cells.  The pressures at the interfaces are local unknowns of
+each face.  Newton's method finds them from the continuity of the flux, and they are condensed.  Each soil conducts like
+a pair of cells with this soil alone (`fitted`).  Steady flow through layers of exponential soil is therefore exact at
+any offset from the grid.
 
 Lines through a cell (see `layers`) with a single soil up to the face conduct in parallel.  Lines with several soils are
 combined: each soil has its mean fraction of the length, in the order along the lines.
@@ -30,8 +30,8 @@ class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
     parallel (l,): mobilities, m^2/(Pa s), of lines with a single retention curve, weighted by their fraction of all
-    lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,), -1 for unused entries;
-    length (s,), fraction of the path; resistance (s,), length over mobility and fraction of lines, Pa s/m^2.
+    lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,): -1 for unused entries;
+    length (s,): fraction of the path; resistance (s,): length / (mobility x fraction of lines), Pa s/m^2.
     """
 
     parallel: NDArray[np.float64]
@@ -63,7 +63,7 @@ class Paths(NamedTuple):
 
 
 class Through(NamedTuple):
-    """Conductances (m,), m/(Pa s), and the slopes of the flux by the pressures on both sides."""
+    """Conductances (m,), m/(Pa s), and derivatives of the flux with respect to the pressures on both sides."""
 
     conductance: NDArray[np.float64]
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -80,7 +80,7 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Soils between nodes of m faces, flat: face, nodes, law, conductance, and drop by the fluid's weight, Pa."""
+    """Links, soils between two nodes of a face: face, nodes, law, conductance, hydrostatic pressure drop, Pa."""
 
     face: NDArray[np.int64]
     low: NDArray[np.int64]
@@ -91,7 +91,7 @@ class _Links(NamedTuple):
 
 
 class _Flows(NamedTuple):
-    """Conductances of links, slopes of their fluxes by the pressures at both nodes, fluxes, and their rounding."""
+    """Conductances of links; derivatives of the flux with respect to both nodes' pressures; fluxes; rounding errors."""
 
     k: NDArray[np.float64]
     own: NDArray[np.float64]
@@ -120,7 +120,7 @@ def through(
     lengths
         Lengths of these paths (m,), m.
     drops
-        Pressure drop by the fluid's weight along each, from the first side to the second (m,), Pa.
+        Pressure drops (m,) by the fluid's weight along each path, from the first side to the second, Pa.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -133,7 +133,7 @@ def through(
 
 
 class _Chain:
-    """Faces with equal numbers of soils in series, and a node at each border."""
+    """Faces with equal numbers of soils in series, and a node at each interface."""
 
     def __init__(self, laws: Laws, paths: Sequence[Paths], count: Sequence[int], p, lengths, drops):
         self._laws, self._p = laws, p
@@ -230,7 +230,7 @@ class _Chain:
         return x, balanced
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
-        """Return conductances and slopes (3, m) between the ends: soils in series, parallel to other lines."""
+        """Return conductances and flux derivatives (3, m) between the ends: soils in series, with parallel lines."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
@@ -245,7 +245,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return conductance and slopes (3, m) of two links in series; first may be None."""
+    """Return conductance and flux derivatives (3, m) of two links in series; first may be None."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

@@ -56,7 +56,7 @@ class Sources(Feeding):
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return its derivative by the cell's pressure, m^d/(Pa s)."""
+        """Return its derivative with respect to the cell's pressure, m^d/(Pa s)."""
         return self._sum(self._slopes, pieces)
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:
@@ -89,5 +89,5 @@ class SourceFeeds(Feeds):
         return Leaving(-gain, gain=np.abs(gain))
 
     def slope(self, at: None, fluid: Fluid) -> NDArray[np.float64]:
-        """Return minus its derivative."""
+        """Return minus the derivative of the inflow."""
         return -self._sources.slope(self._pieces)[self._cells]

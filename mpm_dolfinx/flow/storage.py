@@ -20,9 +20,9 @@ therefore drift from their fluid content.  Points carry this volume defect, `owe
 it, `defect`, at a constant rate over the step.
 
 Q1 with DG0 violates the inf-sup condition for vanishing flow within a step: alternating pressures have no effect.  A
-stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with
-d = d+ + d- and the weight dt, s, of the rate at p.  A face then carries at least tau d A; with larger flow nothing is
-added.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil tau is a quarter of
+stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with d = d+ + d-
+and the weight dt, s, of the rate at p.  The coefficient dt kappa A / d of a face is thus raised to tau d A if it is
+smaller.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil tau is a quarter of
 Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in plastic flow needs up to a hundred times
 more.  The additional damping acts on second differences only (`second_differences`), because damped jumps would smear
 steep pressures.
@@ -61,7 +61,7 @@ from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
 FILTER = 0.75
 """Fraction of beta V that the filtered fixed-stress operator omits for checkerboard modes, in [0, 1].
 
-Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
+Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02 (relative changes of the result).
 """
 
 
@@ -99,8 +99,8 @@ class StorageForms:
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     symmetric
-        Whether to use alpha dJ_Delta as derivative of the content by J_Delta, for a symmetric Jacobian.  The neglected
-        term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
+        Whether alpha serves as the content's derivative with respect to J_Delta, for a symmetric Jacobian.  The
+        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
     flows
         Whether any material conducts; otherwise there are no fluxes.
     softens
@@ -176,7 +176,7 @@ class StorageForms:
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return the derivatives of `change` by the pressure (filled cells,), m^d/Pa, and by nodal displacements.
+        """Return derivatives of `change` with respect to pressure (filled cells,), m^d/Pa, and nodal displacements.
 
         The latter (filled cells, n), m^(d-1), are derivatives of alpha dJ_Delta, for the momentum, then of the content
         if they differ.
@@ -192,9 +192,9 @@ class StorageForms:
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow to other cells by p and the fluid's weight, m^d/s, of active cells, as a local array.
+        """Return the outflow of active cells to other cells, due to p and the fluid's weight, m^d/s, as a local array.
 
-        force (c, d): of inertia on the fluid in the local cells, N/m^3, or None.
+        force (c, d): inertia force on the fluid in the local cells, N/m^3, or None.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -210,8 +210,8 @@ class StorageForms:
 class Outflow:
     """Conductances of the active owned cells at present displacements.
 
-    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow per unit of the cell's potential to other cells,
-    m^d/(Pa s); mobility (n, d): along the axes, m^2/(Pa s); nonorthogonal: non-orthogonal correction, or None.
+    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow to other cells per unit of mass potential,
+    m^d/(Pa s); mobility (n, d): m^2/(Pa s); nonorthogonal: non-orthogonal correction, or None.
     """
 
     at: Sequence[Any]
@@ -224,7 +224,7 @@ class Outflow:
 class Rates:
     """Outflow rates of the owned cells, m^d/s, or with `integrated` outflow volumes, m^d.
 
-    cells: outflow less sources of each; net: outflow from the bodies less sources; turnover: sum of inflow and
+    cells: outflow of each cell less its sources; net: outflow from the bodies less sources; turnover: sum of inflow and
     outflow; gain: absolute value of sources.
     """
 
@@ -300,7 +300,7 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set the change of the residual by displacements u, m^d: of the content and, with slopes, of the fluxes."""
+        """Set the change of the residual by displacements u, m^d: changes of content and, with slopes, of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -356,7 +356,7 @@ class StorageResidual:
     """Residual of the storage in each cell (m^d), and its scales in each part of the bodies (parts,), m^d.
 
     exchanged: sum of all changes; round_off: bound of rounding errors; off: sum of absolute mass errors of the cells;
-    gain: change, plus outflow, less sources; rates: at (u, p).
+    gain: change plus outflow less sources; rates: rates at (u, p).
     """
 
     vector: PETSc.Vec
@@ -385,7 +385,7 @@ class StorageProblem:
     dt
         Weight of the rate at (u, p), s.
     before
-        Outflow volumes by the rate of the substep before.
+        Outflow volumes from the rate of the previous substep.
     softness : (m,)
         Softness of the pieces, see `SoftnessAtPoints`, if the soil may soften.
     defect : (n,), m^d
@@ -393,7 +393,7 @@ class StorageProblem:
     inertial
         Function that returns the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
-        Suctions at which pores of these cells drain (n,), Pa, or None.
+        Suctions (n,), Pa, at which the pores of these cells drain, or None.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -447,7 +447,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the additional damping by the cells' softness (n,), for a damping tau (n,), 1/Pa, less the flow."""
+        """Return the additional damping, less the flow, of cells with softness (n,) and damping tau (n,), 1/Pa."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -505,7 +505,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content by pressure errors (n,), Pa, and its change in the step (n,)."""
+        """Return water-content errors due to pressure errors (n,), Pa, and the content's change in the step (n,)."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -562,8 +562,8 @@ class StorageProblem:
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
         """Return a function: change of the outflow volumes (n,), m^d, for a change of u along a vector, m.
 
-        It is a finite difference without a matrix (Knoll and Keyes 2004), of the conductivity laws and of the geometry
-        of the fluxes.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
+        It is a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the fluxes'
+        geometry.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -642,7 +642,7 @@ class StorageProblem:
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble C = d/dp and B = d/du of the residual at (u, p); data: other pieces than in the residual.
+        """Assemble the residual's derivatives C = d/dp and B = d/du at (u, p); data: other pieces than in the residual.
 
         of_suction: cells (c,), and derivatives of their nodal forces (c, n) by p through suction in laws, m^(d-1).
         """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in unsaturated soil: conductivities by the pressures on both sides of a face.
 
-The conductivity of a face is its mean over the pressures between the two sides (`retention.Conductance`).  The value of
-the wetter side would let a front run ahead.  With gravity this mean is `fitted`, so steady flow through exponential
-soil is exact.  For mixed cells see `series`.
+The conductivity of a face is its mean over the pressures between the two sides (`retention.Conductance`).  With the
+value of the wetter side a front would move too fast.  With gravity this mean is `fitted`, so steady flow through
+exponential soil is exact.  For mixed cells see `series`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ UFL = Functions(ufl.ln, ufl.exp, ufl.tanh, ufl.conditional, ufl.lt, ufl.max_valu
 
 
 class Between(NamedTuple):
-    """k_r between the two sides of a face, and its slopes by both pressures, 1/Pa."""
+    """k_r between the two sides of a face, and its derivatives with respect to both pressures, 1/Pa."""
 
     k: Any
     slopes: tuple[Any, Any]
@@ -48,23 +48,23 @@ class Between(NamedTuple):
 def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
     """Return k_r between the two sides of a face.
 
-    With the mean k of k_r over the pressures, the jump x of k_r over k, y = x fall / jump of the pressure, and
-    s(z) = sinh(z / 2) / (z / 2), it is k s(x + y) / (s(x) s(y)).  This is exact for steady flow with an exponential k_r
-    (Baker 1995), and never exceeds the wetter side.  Without gravity k remains (Kirchhoff 1894).  For nearly equal
-    pressures k is the mean of both sides.
+    With the mean k of k_r over the pressures, the jump x of k_r over k, y = x drop / jump of the pressure, and s(z) =
+    sinh(z / 2) / (z / 2), it is k s(x + y) / (s(x) s(y)).  This is exact for steady flow with an exponential k_r (Baker
+    1995), and never exceeds the wetter side.  Without gravity k remains (Kirchhoff 1894).  For nearly equal pressures k
+    is the mean of both sides.
 
     Parameters
     ----------
     p
         Pressures on both sides, Pa.
     tables
-        Of both sides: integral of k_r, Pa, k_r, its slope, 1/Pa, see `retention.Conductance`.
+        Values on both sides: integral of k_r, Pa; k_r; its derivative, 1/Pa; see `retention.Conductance`.
     drop
         Pressure drop by the fluid's weight from the first side to the second, Pa.
     scale
         Characteristic suction of k_r, Pa.
     of
-        Functions for these arguments.
+        Functions for arguments of their type: numbers, arrays or UFL.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
@@ -96,7 +96,7 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """Conductivities by the pressure, by the numbers of retention curves; 0: soil that stays saturated."""
+    """Conductivities as functions of pressure, by number of the retention curve; 0: soil that stays saturated."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]
@@ -118,7 +118,7 @@ class Laws:
 
 
 class Relative:
-    """Conductivities of cells by their pressures.
+    """Relative conductivities of cells as functions of their pressures.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Relative:
     Attributes
     ----------
     shares
-        DG0: parts of a cell's mobility at k_r = 1, by soil that stays saturated and by each retention curve.
+        DG0: fractions of a cell's mobility at k_r = 1, of soil that stays saturated and of each retention curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -153,14 +153,14 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return k_r of the cell on a side of a face, as UFL of k_r of each retention curve."""
+        """Return k_r of the cell on one side of a face, as a UFL function of each retention curve's k_r."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
         """Set the coefficients of forms for pressures of the local cells (c,), Pa.
 
         Return the fluxes through faces between cells of different soil, see `borders`, or None without such faces.
-        force (c, d): of inertia on the fluid, N/m^3.
+        force (c, d): inertia force on the fluid, N/m^3.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
@@ -188,8 +188,8 @@ class Relative:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k_r (m,) of owned cells along normals (m, d) between their pressures and others (m,), Pa.
 
-        Also return the derivative of k_r times the potential difference by their pressures.  drop (m,), Pa: pressure
-        drop by the fluid's weight out of the cells.
+        Also return the derivative of k_r times the potential difference with respect to these pressures; drop (m,):
+        pressure drop by the fluid's weight out of the cells, Pa.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

@@ -269,7 +269,7 @@ class PointData(Keyed):
         self._gradients: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
-        """Return the points `rows`, at `places`, with the fields of `points`."""
+        """Return the data of the points `rows`: their values of the fields of `points`, at the positions `places`."""
         fields = {name: self._rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 

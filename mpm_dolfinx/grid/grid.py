@@ -58,7 +58,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) by index (n,); floats also for no values, unlike numpy's."""
+    """Return the sums (..., size) of values (..., n) by index (n,), always as floats, unlike numpy's bincount."""
     if values.ndim > 1:
         rows = values.reshape(int(np.prod(values.shape[:-1])), len(index))  # there may be none
         index, whole = (index + size * np.arange(len(rows))[:, None]).ravel(), size * len(rows)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 EMPTY = 1e-2
-"""Weight of an empty cell over that of an average filled cell: its remaining share of memory and time."""
+"""Weight of an empty cell / weight of an average filled cell: its remaining share of memory and time."""
 
 
 def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:

@@ -47,14 +47,14 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A number that follows from other constants."""
+    """A constant that follows from other constants."""
 
     follows = True
 
 
 @dataclass(frozen=True)
 class _FollowsByPlace:
-    """A bulk modulus P_0 / kappa as a function of place; initial stress and kappa are values or functions."""
+    """A bulk modulus P_0 / kappa as a function of position; initial stress and kappa are values or functions."""
 
     stress: object
     kappa: object
@@ -81,7 +81,7 @@ class ModifiedCamClay(Skeleton):
         Normal effective stresses at F = I, the last one out of plane in 2D, circumferential in axisymmetry; tension
         positive, mean < 0.  They must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: initial size of the yield surface over the size through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial size of the yield surface / size through the initial stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
@@ -248,15 +248,15 @@ class BarcelonaBasic(ModifiedCamClay):
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: P_c at the initial suction over the size through the initial stress.
+        Overconsolidation ratio, -, >= 1: P_c at the initial suction / size of the surface through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r
-        lambda of very dry soil over lambda(0), -, > kappa / lambda_, <= 1.
+        lambda of very dry soil / lambda(0), -, > kappa / lambda_, <= 1.
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, at which suction has no effect; usually a hundredth to a half of P_c0.
+        Stress P_r, Pa, > 0, at which suction has no effect; usually 0.01 to 0.5 times P_c0.
 
     Other parameters: see `ModifiedCamClay`.  In a scene with fluid `retention` must be given.  The state is that of
     Modified Cam Clay, with `consolidated` for P_c0, and `suction`, Pa.  Source: Alonso, Gens and Josa (1990); in
@@ -301,8 +301,8 @@ class BarcelonaBasic(ModifiedCamClay):
 class _Return:
     """Return to the yield surface for a given d.
 
-    compaction, flow: a and h; steepness: w exp(-d), squared Q / (M P) at the end; trial_pressure: P_t, Pa; rho:
-    change of ln P_c over a; yields: whether the trial stress is outside.
+    compaction, flow: a and h; steepness: w exp(-d), squared Q / (M P) at the end; trial_pressure: P_t, Pa; rho: (change
+    of ln P_c) / a; yields: whether the trial stress is outside.
     """
 
     def __init__(self, trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):

@@ -30,11 +30,11 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Match of the cone to Mohr and Coulomb's pyramid: (eta, xi) of tangent, sine and cosine of the friction angle."""
+"""Match of the cone to Mohr and Coulomb's pyramid: (eta, xi) as functions of tan phi, sin phi and cos phi."""
 LEAST = 1e-20
 """Constant under the root of the squared deviatoric strain, which keeps its derivative finite.
 
-Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02.
+Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
 """
 
 
@@ -129,12 +129,12 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the trial stress to the yield surface; drag: viscosity over time, Pa.
+    """Return the trial stress to the yield surface; drag: viscosity / time, Pa.
 
     Returns
     -------
-    p, ratio: pressure, Pa, and ratio of the deviator to its trial value; yields: whether the trial stress is outside;
-    apex: 1 for a return to the apex, else 0; hardened: growth of the hardening variable.
+    p: pressure, Pa; ratio: deviator / trial deviator; yields: whether the trial stress is outside; apex: 1 for a return
+    to the apex, else 0; hardened: growth of the hardening variable.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

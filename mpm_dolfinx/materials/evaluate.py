@@ -164,7 +164,7 @@ class LawAtPoints:
 def knows_space(grid: Grid, m: Skeleton) -> bool:
     """Return whether a material's law takes F (3, 3) in plane strain; a user-defined law may be for the plane only.
 
-    m: material with constants as arrays over one point.  For laws with local unknowns it is assumed.
+    m: material with constants as arrays over one point.  The result is True for laws with local unknowns.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -191,7 +191,7 @@ def by_scene(
 ) -> dict[str, Any]:
     """Return the arguments `BY_SCENE` of laws as UFL constants; the time must be set.
 
-    points: of the law; with cells of several sizes they carry their own cell size.
+    points: points of the law; on grids of several cell sizes they carry their cell size.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube as large as a cell, m; with several sizes of the largest cell."""
+    """Return the edge of a square or cube as large as a cell, m; on grids of several sizes, as the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -209,12 +209,12 @@ def mean_size(grid: Grid) -> float:
 MOST = 100.0
 """Upper limit of the softness; perfectly plastic flow has no stiffness.
 
-Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02.
+Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02 (relative changes of the result).
 """
 
 
 class SoftnessAtPoints:
-    """Softness of yielding points: elastic over tangent shear modulus, along the strain of the last step.
+    """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
 
     Volume changes that alternate from cell to cell grow with the strain.  The balancing pressures are these volume
     changes over the damping strength tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau must then

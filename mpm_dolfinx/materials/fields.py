@@ -36,12 +36,12 @@ WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Change of the state from rest at which a point counts as yielded.
 
-Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02.
+Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02 (relative changes of the result).
 """
 STIFFEST = 100.0
-"""Upper limit of the stiffness of trapped pore fluid, in moduli of the skeleton; it limits rounding errors.
+"""Upper limit of (stiffness of trapped pore fluid) / (modulus of the skeleton); it limits rounding errors.
 
-Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02.
+Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02 (relative changes of the result).
 """
 
 
@@ -247,7 +247,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return rows (n, 2) that are equal for points of equal conductivity: conductivity, m/s, and number of the law.
+        """Return rows (n, 2), equal for points of equal conductivity: conductivity, m/s, and number of the law.
 
         With a law of position all rows differ.  The fractional part of the number distinguishes retention curves.
         """
@@ -286,12 +286,12 @@ class SceneMaterials:
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the suction at which pores of the points drain (n,), Pa; infinite if they stay saturated."""
+        """Return the suction (n,), Pa, at which the pores of each point drain; infinite if they stay saturated."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the part of the pore pressure in total stresses at the points (n,), Pa: alpha chi p."""
+        """Return the contribution of the pore pressure to the total stress at the points (n,), Pa: alpha chi p."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
@@ -392,7 +392,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the specific yield at the points, and the suction, Pa, for its full drainage (n, 2)."""
+        """Return (n, 2): specific yield at the points, and suction, Pa, for its full drainage."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -466,7 +466,7 @@ class SceneMaterials:
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together.
+        """Return the effective Cauchy stress (n, d, d), Pa, at the points; a collective call.
 
         In axisymmetry (n, 3, 3).
         """
@@ -476,14 +476,14 @@ class SceneMaterials:
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa, also out of plane; on all processes together."""
+        """Return the effective Cauchy stress (n, 3, 3), Pa, also out of plane; a collective call."""
         out = np.zeros((len(points), 3, 3))
         for law, rows, data in self._placed(points):
             out[rows] = law.stress_3d(data)
         return out
 
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; on all processes together.
+        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; a collective call.
 
         For laws without an energy it is Hencky's energy with constant moduli if `elastic_hencky`, else zero.
         """
@@ -500,7 +500,7 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
+        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; a collective call."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(

@@ -34,7 +34,7 @@ class K0:
     """Initial effective stress of soil at rest under its own weight.
 
     The vertical stress is the overburden of soil and fluid plus the surcharge, less biot times the pore pressure.  The
-    horizontal stresses, radial and circumferential in axisymmetry, are K0 times that.  They are exact for level ground
+    horizontal stresses, radial and circumferential in axisymmetry, are K0 times this.  They are exact for level ground
     and layers; otherwise an equilibrium step follows, with a warning if it changes them by more than 5 %, as on slopes.
 
     Parameters
@@ -77,8 +77,8 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
     level
         Height, m, along the last axis.
     unit_weight
-        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside a scene 9810.  A warning appears if it
-        differs from that of the scene's fluid.
+        Unit weight of the fluid, N/m^3, > 0; by default of the scene's fluid, outside a scene 9810.  A warning appears
+        if it differs from the scene's fluid.
     """
     numbers("hydrostatic: level", level)
     if unit_weight is not None:
@@ -89,7 +89,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, N/m^3; by default that of the scene's fluid, outside a scene 9810."""
+    """A water pressure with a unit weight, N/m^3; default: unit weight of the scene's fluid, outside a scene 9810."""
 
     @property
     def unit_weight(self) -> float:
@@ -142,14 +142,14 @@ class InitialStresses:
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
-        """Return points with the elastic strains of their initial stress; on all processes together.
+        """Return points with the elastic strains of their initial stress; a collective call.
 
         Parameters
         ----------
         present
             Which bodies are present, for the overburden.
         gravity : (d,), m/s^2
-            None without.
+            Acceleration, or None.
         """
         if not self.given:
             return points
@@ -194,7 +194,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return overburden, Pa, height of the surface, m, and biot times pressure, Pa, of points, for K0."""
+        """Return, for K0, overburden, Pa, height of the surface, m, and biot times pore pressure, Pa, at the points."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -217,9 +217,9 @@ class InitialStresses:
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); on all processes together.
+    """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); a collective call.
 
-    In Modified Cam Clay the stress is a constant of the material; others get elastic strains, see `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter; elsewhere elastic strain causes it, see `_ElasticStrains`.
 
     Raises
     ------
@@ -253,8 +253,8 @@ def stressed(
 class _ElasticStrains:
     """Elastic strains for target stresses, by Newton's method.
 
-    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa;
-    given, plastic : (n,) which points have the stress as a constant, and which have C_p^-1.
+    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1; points: n points; target (n, 3, 3): stress,
+    Pa; given (n,): whether the stress is a parameter; plastic (n,): whether the law has C_p^-1.
     """
 
     materials: SceneMaterials
@@ -309,7 +309,7 @@ class _ElasticStrains:
         return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the strains (n, k) after a Newton step; missing: stress minus target, Pa.  Slopes are differences."""
+        """Return the strains (n, k) after a Newton step with finite differences; missing: stress minus target, Pa."""
         count = strain.shape[1]
         free = self.free
         (_, shear) = self.moduli()

@@ -6,8 +6,8 @@ round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-with the value y* and the derivative of the solution by F.  UFL's derivative of a stress in y and F is then the
-consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  A stress without a
+with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress in y and F is then
+the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  A stress without a
 derivative uses y* alone.  The stress of a law with an energy is itself a derivative.  There y has a second-order term,
 and its coefficients also follow from f = 0.  A law may instead return y(z) and its derivative in numpy.
 """
@@ -36,7 +36,7 @@ MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
 
 
 class Solved(NamedTuple):
-    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k); function for derivatives."""
+    """Solution at some points: key of their data; unknowns (n, m); trial values (n, k); function for derivatives."""
 
     key: object
     unknowns: NDArray[np.float64]
@@ -45,7 +45,7 @@ class Solved(NamedTuple):
 
 
 class Derived(NamedTuple):
-    """Derivatives by the trial values: first, slopes Y (n, m k); for a law with an energy second, bends (n, m k k)."""
+    """Derivatives by the trial values: slopes Y (n, m k); second ones, bends (n, m k k), for laws with an energy."""
 
     slopes: NDArray[np.float64]
     bends: NDArray[np.float64] | None = None
@@ -70,8 +70,8 @@ class LocalUnknowns:
     values
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
-        The unknowns and `trial` for expressions without a derivative by F; kernels then skip the trial values.  For a
-        law with an energy the same as `values`.
+        The unknowns and `trial` for expressions without a derivative with respect to F: kernels skip the trial values.
+        Laws with an energy have the same as `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -106,7 +106,7 @@ class LocalUnknowns:
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
     def update(self, data: PointData, derive: bool = True) -> None:
-        """Solve for the unknowns of points at their present F, and derive them; all processes together.
+        """Solve for the local unknowns of the points at their present F, and differentiate them; a collective call.
 
         derive: whether the next expression depends on `values`, not on `known` alone.
 
@@ -121,7 +121,7 @@ class LocalUnknowns:
             self.derive(data)
 
     def derive(self, data: PointData) -> None:
-        """Derive the last solution of the unknowns by F; all processes together."""
+        """Differentiate the last solution of the unknowns with respect to F; a collective call."""
         solved = self._at(data)
         self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
 
@@ -188,7 +188,7 @@ class _Equations:
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution at points with trial values (n, k); all processes together."""
+        """Return the solution at points with trial values (n, k); a collective call."""
         if self._law.residual is None:
             return self._in_numpy(data, trial)
         m, n = self.count, len(trial)
@@ -220,13 +220,13 @@ class _Equations:
         return Solved(data.key, y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged if a point on any process is lost, with the first such point; all processes together."""
+        """Raise NotConverged if a point on any process is lost, with the first such point; a collective call."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution of a law with `solution` in numpy."""
+        """Return the local unknowns of a law that has a numpy function `solution`."""
         n, k, values, start = *trial.shape, {}, 0
         for name, shape in self._trial.items():  # copies, because a law may change its arguments
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
@@ -291,13 +291,13 @@ class _Equations:
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
-        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: this, or a function."""
+        """Return the derivative (n, ..., ...) of an unknown with respect to a trial value; given: array or function."""
         what = f"{self._title}: derivative of {of} by {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the slopes (n, m, k) of one unknown; given: its derivatives by some of the trial values."""
+        """Return the slopes (n, m, k) of one unknown; given: its derivatives with respect to some trial values."""
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
             slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))
@@ -306,7 +306,7 @@ class _Equations:
 
 
 def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
-    """Return the derivative of a component i along y = y* + Y (z - z*), by the component j of z, as UFL."""
+    """Return the derivative of component i with respect to component j of z, along y = y* + Y (z - z*), as UFL."""
     return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 

@@ -136,7 +136,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
     Returns
     -------
-    Stresses (n, 3), their derivatives by the strains (n, 3, 3), and 1 where there was flow (n,).
+    Stresses (n, 3), their derivatives with respect to the strains (n, 3, 3), and 1 in plastic flow (n,).
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
@@ -247,7 +247,7 @@ class _Return:
 
 
 def _inverse(A: NDArray) -> NDArray:
-    """Return the inverses of matrices (n, 2, 2), in a tenth of LAPACK's time."""
+    """Return the inverses of matrices (n, 2, 2); LAPACK takes ten times as long."""
     adjugate = A[:, ::-1, ::-1].transpose(0, 2, 1) * [[1, -1], [-1, 1]]
     return adjugate / (A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])[:, None, None]
 

@@ -28,7 +28,7 @@ BY_SCENE = ("dt", "cell_size")
 """Arguments of laws from the scene: time since the start of the step, s, and mean length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""States that the scene sets: suction max(-p, 0) at the end of a substep, and as seeded, Pa."""
+"""States that the scene sets: the suction max(-p, 0), Pa, at the end of a substep, and at seeding."""
 
 LOCKING = 0.43
 """Poisson's ratio above which cells use the mean dilatation, at twice the cost of a step.
@@ -40,7 +40,7 @@ at 0.45, -2.0 and +0.21 % at 0.49, -10.3 and -0.02 % at 0.499; at h = 0.06 m and
 SEPARATION = 1e-4
 """Relative separation of equal eigenvalues, which keeps their derivatives finite.
 
-Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02.
+Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02 (relative changes of the result).
 """
 
 
@@ -99,15 +99,15 @@ class Skeleton:
         NaN or infinity means that there is no solution, and cuts the step.  A law whose `energy` is not stationary in
         these unknowns takes many Newton steps, because second derivatives are missing.
     trial
-        (F, ...) -> {name: UFL}: trial values, through which the residuals depend on F; without it the residuals take F.
-        Residuals do not get values other than UFL; `kirchhoff` and `update` may take `trial` with all values.
+        Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
+        take F itself.  Values other than UFL are passed to `kirchhoff` and `update` only, as `trial`.
 
     All these functions may take `dt`, the time since the start of the step, s, for rate-dependent laws.  The state at
     the end of a step must return the stress of the step at dt = 0.  They may take `cell_size`, the mean length of a
     cell, m, which makes softening independent of the grid.
 
     A law that depends on suction has `suction`: 0.0 in its state, and may have `suction_at_start`: 0.0.  The scene sets
-    them: max(-p, 0) at the end of a substep, and as seeded, Pa.  For local unknowns the suction is a `trial` value.
+    both to max(-p, 0), Pa: at the end of a substep, and at seeding.  For local unknowns suction is a `trial` value.
 
     For every law bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 
@@ -173,7 +173,7 @@ class Skeleton:
 
     @staticmethod
     def arguments_of(function: Callable | None) -> list[str]:
-        """Return the names of the arguments of one of the law's functions."""
+        """Return the argument names of one of the law's functions."""
         return [] if function is None else list(signature(function).parameters)
 
     def __post_init__(self):
@@ -376,7 +376,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; equal ones are separated by `separation`."""
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; `separation` separates equal eigenvalues."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
@@ -445,14 +445,14 @@ class unsaturated:
     """Conductivity law for flow below a free surface; use it as `conductivity_law` of a material.
 
     The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
-    Khoshgoftaar 1979).  Pores lose their `specific_yield` by the same cubic and retain the rest.  The weight counts all
-    pores as full.  The pressure is taken at the start of each substep.  Steady flow therefore needs steps of some
+    Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The weight counts
+    all pores as full.  The pressure is taken at the start of each substep.  Steady flow therefore needs steps of some
     (cell size)^2 / (coefficient of consolidation), and a free surface must pass less than a cell in a step.
 
     Parameters
     ----------
     suction
-        Pa, > 0: half to once the weight of water over the height of a cell.
+        Suction, Pa, > 0: 0.5 to 1 times the unit weight of water times the height of a cell.
     least
         Relative conductivity of drained soil, in (0, 1).
     specific_yield

@@ -35,7 +35,7 @@ class SofteningDruckerPrager(DruckerPrager):
     Parameters
     ----------
     residual
-        Residual cohesion c_r, Pa, in [0, cohesion]; equal to the cohesion there is no softening.
+        Residual cohesion c_r, Pa, in [0, cohesion]; if it equals the cohesion, there is no softening.
     slip
         Slip s along a shear band, m, > 0, at which the cohesion is c_r.  Cells so large that soil would soften faster
         than it unloads are refused.

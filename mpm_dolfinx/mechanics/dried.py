@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Derivatives of nodal forces by the cells' pressures, through laws that depend on suction.
+"""Derivatives of nodal forces with respect to the cells' pressures, through laws that depend on suction.
 
 The stress of such a law depends on the pressure in addition to the term chi p of Bishop's stress.  So does the mean
 stress pi of cells with mean dilatation.
@@ -21,7 +21,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 class OfSuction:
-    """Derivatives by the cells' pressures of the forces that laws give.
+    """Derivatives of the laws' forces with respect to the cells' pressures.
 
     Parameters
     ----------
@@ -42,12 +42,12 @@ class OfSuction:
         Parameters
         ----------
         number, points, locks
-            The part, its pieces, and whether they see the mean dilatation.
+            Number of the part, its pieces, and whether their laws take the mean dilatation.
         F
             Deformation gradient (d, d), a UFL variable.
         slopes
-            UFL derivatives by the pressure.  The first is that of the first Piola-Kirchhoff stress (d, d).  With mean
-            dilatation, the second is that of its slope by theta.  Empty without suction.
+            UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d) and, with mean
+            dilatation, of its derivative with respect to theta.  Empty without suction.
         """
         share = 1 / ufl.det(points.F)
         tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -58,7 +58,7 @@ class OfSuction:
             (self._locked if locks else self._free)[number] = CellSums([*along, *scalars], points)
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return cells (c,) and the derivatives (c, n), m^(d-1), of the forces on their nodes by their pressures."""
+        """Return cells (c,), and derivatives (c, n), m^(d-1), of nodal forces with respect to their pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

@@ -31,16 +31,16 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength gamma of the ghost penalty.  Plateau (beam): halved 9.9e-06, doubled 1.9e-05, cells 1.5e-02."""
+"""Strength of the ghost penalty. Plateau (beam): halved 9.9e-06, doubled 1.9e-05, cells 1.5e-02 (relative changes)."""
 YIELDING = 0.02
-"""Least factor of the penalty for nearly incompressible laws with a state."""
+"""Smallest factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
 """A cell with a smaller filling, relative to a neighbour, is nearly empty: the face between them is penalised.
 
-Plateau (soil): halved 1.3e-03, doubled 5.9e-04, cells 3.0e-02.
+Plateau (soil): halved 1.3e-03, doubled 5.9e-04, cells 3.0e-02 (relative changes of the result).
 """
 SPARSE, FULL = 0.2, 0.9
-"""Strength for integration at the points; filling below which the faces of a cell then carry the penalty."""
+"""Strength for integration at the points; volume fraction below which a cell's faces then carry the penalty."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
@@ -78,13 +78,13 @@ class GhostPenalty:
     Attributes
     ----------
     modulus
-        Mean over the material in the cell of the penalty's modulus, Pa, see `stiffness`.
+        Modulus of the penalty, Pa: mean over the material in the cell, see `stiffness`.
     shear
-        Mean over the material in the cell of the shear modulus, Pa, of laws with a state; zero for other laws.
+        Shear modulus, Pa, of laws with a state: mean over the material in the cell; zero for other laws.
     firmness
         Form of the elastic shear stiffness over whole cells, times their volume fraction: regularises tangents.
     fill, beside
-        Volume fraction of each cell, and the largest one among its neighbours.
+        Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """
 
     def __init__(self, grid: Grid, V: fem.FunctionSpace, at_points: bool):
@@ -140,7 +140,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """The ghost penalty on all faces of a cut, and on its faces at walls of the grid."""
+    """The ghost penalty on all inner faces of partly filled cells, and its part on cells at walls of the grid."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

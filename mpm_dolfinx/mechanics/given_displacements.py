@@ -241,7 +241,7 @@ class HoldLoads(Loads):
     row : (m,)
         Row in `held` of each component.
     share : (m, 2^d)
-        Fraction of its force on each node, without the part that grid boundary conditions bear.
+        Fraction of each component's force on each node, without the part carried by grid boundary conditions.
     place
         Time and cut of the substep.
     """
@@ -274,8 +274,8 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces of cell means to their multipliers, on sides that lack a part of their way.
 
-        Such a body resists its side more stiffly than one cell of it would, as sealed water does.  The updates end if
-        the mean gap no longer falls by half: the cells cannot follow the side any further.
+        Such a body, for example sealed water, resists the side's motion more stiffly than one of its cells would.  The
+        updates end if the mean gap no longer falls by half: the cells cannot follow the side any further.
         """
         if not self._place.dt:
             return False
@@ -350,7 +350,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding error of nodal forces, with the penalty's: stiffness times that of coordinates."""
+        """Return the rounding error of nodal forces, with the penalty's: stiffness times the error of coordinates."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides in the cells: a stiff penalty on the mean, a weak one on the deviation from it.
 
-A Q1 field has too few nodes in a cell to follow a side at many points. A stiff penalty at each of them would lock sides
-that are curved or inclined to the grid. The weak penalty controls the modes with zero mean in each cell. The present
-traction of the body, rotated with the side, is applied explicitly. Both penalties then carry the traction increment of
-the step only, and their gap is smaller by that factor.
+A Q1 field has too few nodal displacements in a cell to meet constraints at many points of a side. A stiff penalty at
+each of them would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero
+mean in each cell. The present traction of the body, rotated with the side, is applied explicitly. Both penalties then
+carry the traction increment of the step only, and their gap is smaller by that factor.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side to a grid axis at which the cells can follow every point, even at constant volume."""
+"""Largest slope of a side relative to a grid axis at which cells can follow all its points, even at constant volume."""
 EVERYWHERE = 1e2
 """Normal penalty stiffness at each point of such a side, in units of (resisting modulus) / (cell size).
 
-Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02.
+Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02 (relative changes of the result).
 """
 TENSE = 10
-"""Factor of the stress at a side in the penalty's modulus: a side held less stiffly than its stress buckles.
+"""Factor of a side's stress in the penalty's modulus: a side with a penalty softer than its stress buckles.
 
-Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02.
+Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02 (relative changes of the result).
 """
 CARRIED = 0.3  # traction increment of a step over resisting modulus and stress: larger ones are not physical
 
@@ -38,11 +38,11 @@ CARRIED = 0.3  # traction increment of a step over resisting modulus and stress:
 class HeldPoints(NamedTuple):
     """Integration points on sides with prescribed displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x, gap : (n, d) position, and
-    prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
-    modulus, tension, resistance, firm : (n,) penalty modulus, norm of the stress at the last reset of the grid,
-    resisting modulus, and confined modulus, each times area, N.
-    normal : (n, d) area vector at the last reset, m^(d-1); force : (n, d) present force, rotated with the side, N.
+    number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x : (n, d) position, m; gap : (n,
+    d) prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
+    modulus, tension, resistance, firm : (n,) penalty modulus, stress norm at the last reset of the grid, resisting
+    modulus and confined modulus, all times area, N. normal : (n, d) area vector at the last reset, m^(d-1); force : (n,
+    d) present force, rotated with the side, N.
     """
 
     number: NDArray[np.int64]
@@ -72,13 +72,13 @@ class HeldCells:
     Attributes
     ----------
     number, cell, x, shape, moments
-        Of each row: condition, cell, mean position (m), mean shape functions, mean products of the offsets from the
-        cell's midpoint.
+        Condition, cell, mean position (m), mean shape functions, and mean products of the offsets from the cell's
+        midpoint, one for each row.
     stiffness, limit
-        By component: penalty stiffness, N/m, normal to a side along the grid with the confined modulus; and for means
-        the largest plausible force, N. Larger forces are artefacts.
+        Penalty stiffness of each component, N/m, with the confined modulus along the normal of a side along the grid;
+        for means, the largest plausible force, N. Larger forces are artefacts.
     way
-        Of each row: increment (d,) of the prescribed displacement in the step, m.
+        Increment (d,) of the prescribed displacement in the step, m, for each row.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):
@@ -147,8 +147,8 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), stiffness (k,), N/m, gaps (k,), m, and fractions (k, 2^d) of the forces on the nodes, without the
-        part of the wall; index of a row that must move but whose nodes are all fixed, or -1.
+        Rows (k,); their stiffness (k,), N/m; gaps (k,), m; fractions (k, 2^d) of the force on each node, without the
+        wall's part; index of a row that must move but has fixed nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -174,9 +174,9 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the rows (k,) with nodes at a wall, and others that also have rows without nodes at a wall.
+        """Return which rows (k,) have a node at a wall, and another node that a row without nodes at walls also has.
 
-        number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): nodes at the wall.
+        number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): flags of nodes at a wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)
@@ -196,8 +196,8 @@ class HeldCells:
         """Return the conditions whose force exceeds its limit, with the position (d,), m, of the largest excess.
 
         A Q1 field cannot always meet the means of two neighbouring cells, as for a side along a grid line. The
-        penalties then push it to and fro. Only their sum at the nodes acts on the body and counts in the reaction. A
-        row therefore exceeds its limit only if both its own force and the condition's nodal forces do.
+        penalties then push the side to and fro. Only their sum at the nodes acts on the body and counts in the
+        reaction. A row therefore exceeds its limit only if both its own force and the condition's nodal forces do.
 
         Parameters
         ----------

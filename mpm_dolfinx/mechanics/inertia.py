@@ -46,12 +46,12 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass. A tenth and ten times of it change neither momentum nor energy of a turning block.
+"""Strength c of the ghost mass. With 0.002 and 0.2, momentum and energy of a turning block do not change.
 
 `tests/test_inertia.py` tests this.
 """
 RELAXES = 2.0
-"""Rate, per cell of corner motion, at which point velocities relax to grid velocities.
+"""Relaxation rate of point velocities towards grid velocities, per cell that the domain's corners have moved.
 
 It removes velocity modes of the points that the nodes cannot represent. In a test, a bar of 20 cells vibrates and flies
 over 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates of 0,
@@ -134,7 +134,7 @@ def moving(
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d); 2 x 2 ones take a tenth of numpy's time."""
+    """Return the inverses of matrices (n, d, d); for 2 x 2 matrices in a tenth of numpy's time."""
     if A.shape[1] > 2:
         return np.linalg.inv(A)
     (a, b), (c, e) = A.transpose(1, 2, 0)
@@ -278,7 +278,7 @@ class Mass:
     unknowns
         Unknown displacements.
     M, held
-        Mass matrices, kg, of the unknowns, and with rows for the displacements that grid boundary conditions fix.
+        Mass matrices, kg: of the unknowns, and with rows for displacements fixed by grid boundary conditions.
     """
 
     def __init__(
@@ -363,7 +363,7 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry without the circumferential one."""
+    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry without the circumferential component."""
     d = points.x.shape[1]
     return points.data[RATE] @ inverses(points.F[:, :d, :d])
 
@@ -425,7 +425,7 @@ class Inertia(Loads):
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns, m/s, at the start of a step and after a substep; its acceleration, m/s^2."""
+    """Velocities of the unknowns, m/s, at the start of a step and after a substep; last acceleration, m/s^2."""
 
     start: PETSc.Vec
     velocity: PETSc.Vec

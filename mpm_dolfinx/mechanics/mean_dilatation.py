@@ -90,15 +90,15 @@ class MeanDilatation:
         Parameters
         ----------
         law
-            Class of its law.
+            Class of the part's law.
         points
-            Its pieces, with the field F (d, d), the deformation gradient at the start of the step.
+            Pieces of the part, with the field F (d, d), the deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
-            Its F-bar modification, see `fbar`.
+            F-bar modification of F, see `fbar`.
         ratio
-            det Delta, of F over that at the start of the step.
+            det Delta, with Delta F_n = F.
         values
             UFL values of the law's parameters, state and local unknowns.
         known
@@ -106,8 +106,8 @@ class MeanDilatation:
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative by F (d, d, d,
-        d), Pa, for the tangent; and further sums of the tangent in each cell, for `assemble_matrix`.
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative with respect
+        to F (d, d, d, d), Pa, for the tangent; and further sums of the tangent in each cell, for `assemble_matrix`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         self._ratios.append(CellSums([ratio], points))
@@ -120,7 +120,7 @@ class MeanDilatation:
         return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar) by F and by theta; for a law without an energy, of its work."""
+        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -129,7 +129,7 @@ class MeanDilatation:
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
     def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
-        """Return the derivatives by a pressure p, a UFL variable, of both that `_stress` gives."""
+        """Return the derivatives of both results of `_stress` with respect to a pressure p, a UFL variable."""
         return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
 
     def total(
@@ -139,10 +139,10 @@ class MeanDilatation:
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives by F and by theta of both results of `_stress`.
+        """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In the plane a law without an energy is differentiated by Fbar only, which takes half of the time. With Fbar = s
-        F
+        In the plane a law without an energy is differentiated with respect to Fbar only, in half of the time. With Fbar
+        = s F
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
@@ -162,7 +162,7 @@ class MeanDilatation:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return the derivative by F of a component of tau, from its derivative C by Fbar."""
+            """Return the derivative of a component of tau with respect to F; C: derivative with respect to Fbar."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n
@@ -180,7 +180,7 @@ class MeanDilatation:
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f to the means of a quantity over the locking pieces of each cell; sums: its sums (cells, 1)."""
+        """Set f to the mean of a quantity over the locking pieces of each cell; sums (cells, 1): its sums."""
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
@@ -236,7 +236,7 @@ def _dev(tau, F):
 
 
 class StressAtPoints:
-    """The stress P of a law and its derivative by theta at the points of a part, evaluated once for residual and pi.
+    """Stress P of a law, and its derivative by theta, at the points of a part: evaluated once for residual and pi.
 
     Parameters
     ----------

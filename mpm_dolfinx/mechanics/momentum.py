@@ -181,7 +181,7 @@ class MomentumForms:
             self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return derivatives of the forces at (u, p) by the cells' pressures through suction, see `OfSuction.rows`."""
+        """Return derivatives of forces with respect to cell pressures through suction, see `OfSuction.rows`."""
         return [] if self._of_suction is None else self._of_suction.rows(data)
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
@@ -269,7 +269,7 @@ class MomentumForms:
 
 
 def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
-    """Return the derivative by a pressure p, a UFL variable, of the first Piola-Kirchhoff stress of a law."""
+    """Return the derivative of a law's first Piola-Kirchhoff stress with respect to a pressure p, a UFL variable."""
     return [ufl.diff(law.first_piola(F, values), p)]
 
 
@@ -316,7 +316,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """Rounding error of a part, N, if all of its unknowns had that of this one."""
+        """Rounding error of a part, N, if all of its unknowns had the rounding error of this unknown."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = np.setdiff1d(active, dofs)
@@ -492,7 +492,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the same, and the norms (parts,), N, of its terms."""
+        """Return the result of `unbalanced`, and the norms (parts,), N, of its terms."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -508,7 +508,7 @@ class MomentumProblem:
         return b, [*system.forces_of_parts([*terms, external])]
 
     def powers(self) -> dict[str, float]:
-        """Return powers at u on this process, W: of stresses, viscous resistance, friction and external loads."""
+        """Return the powers of stresses, viscous resistance, friction and external loads at u on this process, W."""
         forms, unknowns = self.forms, self.system.unknowns
         v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # zero at fixed nodes
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
@@ -568,7 +568,7 @@ class MomentumProblem:
         return out
 
     def of_suction(self, data: QuadratureData | None = None) -> list[tuple[NDArray, NDArray]]:
-        """Return derivatives of the forces by the cells' pressures through suction, see `OfSuction.rows`."""
+        """Return derivatives of the forces with respect to cell pressures, through suction: see `OfSuction.rows`."""
         return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(

@@ -45,7 +45,7 @@ much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % t
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return the weight of the corner-based volume ratio at the start of a step in the cells of a material."""
+    """Return a material's weight of the corner-based volume ratio in cells at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
@@ -54,7 +54,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step; points of each part (`SceneMaterials.parts`); rows of each part in the former."""
+    """Integration points of a step; points of each part (`SceneMaterials.parts`); each part's rows among all points."""
 
     pieces: PointData
     parts: tuple[PointData, ...]
@@ -73,7 +73,7 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Positions of the pieces of a cut, with rows and positions of each part.
+    """Positions of the pieces of a cut; rows and positions of the pieces of each part.
 
     lever (m, d), m: vectors to the pieces from the centroid of the material in their cell, once they are known.
     """
@@ -220,7 +220,7 @@ class QuadraturePoints:
         return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data of the points that change from step to step."""
+        """Return the point data that change from step to step."""
         fields = {"F": points.F, **self._scene.state(points)}
         fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
         if self._extended:  # fields of laws are known for all materials; in `data` they are zero at points of others
@@ -234,7 +234,7 @@ class QuadraturePoints:
         return fields
 
     def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return F, and a stretch across the plane if laws see one, at the pieces of this process's points."""
+        """Return F, and the out-of-plane stretch if laws take it, at the pieces of this process's points."""
         of_materials = self._scene.elastic(points), self._scene.soil_rows(points)
         if not self._scene.across:
             return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}

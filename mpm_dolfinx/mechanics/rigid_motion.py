@@ -34,7 +34,7 @@ def rigid_motion(
     comm
         The processes; the call is collective.
     holds
-        Rows of prescribed displacements: direction, gap along it, m, and stiffness, the weight of the row.
+        Rows of prescribed displacements: direction; gap along it, m; stiffness, which is the weight of the row.
     x : (n, d), m
         The positions.
     counts : (m,)

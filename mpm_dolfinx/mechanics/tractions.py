@@ -231,4 +231,4 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
 
 
 _EDGES = {2: np.array([[0], [1]]), 3: np.array([[0, 1], [1, 3], [3, 2], [2, 0]])}
-"""Corners of the edges of a face; in 2D, its ends."""
+"""Corners of each edge of a face; in 2D, ends of the face."""

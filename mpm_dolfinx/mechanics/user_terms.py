@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.user_functions import compiling, term_of
 
 
 class OwnTerm(NamedTuple):
-    """A user-defined term: its definition, its points, its form, and the form's derivative by u, None if it is zero."""
+    """A user-defined term: its definition, points, form, and the form's derivative with respect to u, None if zero."""
 
     given: Callable | OnSide
     points: FormPoints

@@ -68,8 +68,8 @@ class Active:
     slot : (cells,)
         Index of each cell among the owned active ones.
     centroid, opening : (cells, d), (cells, d, 2)
-        Offsets of the centroids of the contents from the midpoints, m, and open fractions of faces.  Empty without
-        fluid, like `slot`.
+        Offsets of the material's centroids from the cells' midpoints, m; open fractions of faces.  Empty without fluid,
+        like `slot`.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):

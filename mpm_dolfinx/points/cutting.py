@@ -29,7 +29,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
-"""Least volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
+"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut at a time, for the processor's cache
 TANGLED = 0.2  # volume spanned by the corners over the domain's: below it corners are re-initialised from F
 
@@ -38,14 +38,13 @@ TANGLED = 0.2  # volume spanned by the corners over the domain's: below it corne
 class Pieces:
     """Particle domains cut by the cells; arrays over the pieces, ordered by point and cell.
 
-    point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
-    fraction : (m,) volume over the domain's volume; x : (m, d) centroid, m;
-    faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1);
-    mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2;
-    hoop : (m, 4) in axisymmetry, else (m, 0): of the section, offset (2,) of the centroid from the cell's midpoint, m;
-    mean product of the offset's components, m^2; radius of the centroid, m;
-    second : (m, d, d) on request, else (m, 0): second moments about the centroid over volume, m^2; in axisymmetry for
-    pieces that are symmetric in the plane.
+    point : (m,) index of the domain; cell : (m,) lexicographic number of the cell; fraction : (m,) fraction of the
+    domain's volume; x : (m, d) centroid, m; faces : (m, d, 2) area of the piece on the lower and upper face of its
+    cell, m^(d-1); mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other
+    axes, m^2; hoop : (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's
+    midpoint, m; mean product of its components, m^2; radius of this centroid, m; second : (m, d, d) on request, else
+    (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces that are symmetric in the
+    plane.
     """
 
     point: NDArray[np.int64]
@@ -64,7 +63,7 @@ def corner_bits(dim: int) -> NDArray[np.int64]:
 
 
 def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the corners (2d, 2^(d-1)) of the faces of a domain; face 2 a + e is the one at end e of axis a."""
+    """Return the corners (2d, 2^(d-1)) of a domain's faces; face 2 a + e is at end e of axis a."""
     bits = corner_bits(dim)
     return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
@@ -342,7 +341,7 @@ def _sum(
     owner: NDArray[np.int64],
     second: bool,
 ) -> Pieces:
-    """Sum the slices of the surfaces by point and cell into pieces."""
+    """Sum the surfaces' slices to one piece for each point and cell."""
     d = grid.dim
     index = np.floor(s.sum(axis=0) / d)
     least = s.min(axis=0)
@@ -366,7 +365,7 @@ def _sum(
 
     @cache
     def pair(a: int, b: int) -> NDArray[np.float64]:
-        """Return the sums of products of two coordinates over the vertices of the slices."""
+        """Return the products of two coordinates, summed over the vertices of the slices."""
         return (x[:, a] * x[:, b]).sum(axis=0)
 
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
@@ -436,7 +435,7 @@ def _sum(
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return second moments over volume (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
+    """Return (second moments) / volume (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
 
     rings: whether the domains are sections of rings, in axisymmetry.
     """
@@ -446,10 +445,10 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return second moments over volume (n, 2, 2), m^2, of rings about their centroids, from symmetric sections.
+    """Return (second moments) / volume (n, 2, 2), m^2, of rings about their centroids, from symmetric sections.
 
-    spread (n, 2, 2), m^2, and radius (n,), m, belong to the sections and their centroids; spread[:, 0] / radius is the
-    vector from there to the centroid of the ring.
+    spread (n, 2, 2): second moments of the sections, m^2; radius (n,): radius of their centroids, m; spread[:, 0] /
+    radius is the vector from the section's centroid to the ring's centroid.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -482,7 +481,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals of products of two coordinates over the pieces of slots, from the corners of their cells.
+    """Return the integrals, over the pieces of slots, of products of two coordinates from the corners of their cells.
 
     Parameters
     ----------
@@ -492,12 +491,12 @@ def _products(
         Vertices (d, d, m) of slices, their sums (d, m), and the areas (m,) of the slices, projected along the first
         axis.
     pair, total
-        Functions that sum products of two coordinates over the vertices of slices, and values of slices over slots.
+        Functions: sum of products of two coordinates over vertices of slices; sum of slices' values over slots.
     """
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return the integrals over the slices of a product of up to three coordinates."""
+        """Return the integrals of a product of up to three coordinates over the slices."""
         if not factors:
             return area
         if len(factors) == 1:
@@ -534,8 +533,8 @@ def cut_faces(
 
     Returns
     -------
-    Of each point: its face, position (n, d), local coordinates (n, e), and fraction of the face; and the middle (n, d)
-    of the part of the face in its cell.
+    Face (n,), position (n, d), local coordinates (n, e) and fraction of the face (n,) of each point; middle (n, d) of
+    the part of the face in its cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -629,7 +628,7 @@ def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lengths or areas, up to a factor, of segments or triangles (k+1, e, m)."""
+    """Return lengths of segments, or areas of triangles, (k+1, e, m), up to a factor."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.sqrt((e[0] ** 2).sum(axis=0))

@@ -21,14 +21,14 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 RADIUS = 3.0
-"""Offset, over the spacing of the data, from which on the weight is zero.
+"""Offset, in spacings of the data, from which on the weight is zero.
 
 Source: exact, at an end of the data the points at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of the coefficients of each degree relative to the data: they matter only for undetermined coefficients.
+"""Weights of each degree's coefficients relative to the data; they only affect undetermined coefficients.
 
-A hundredth and a hundred times as much change pressures of a consolidating column by 1e-5 of the load.
+Factors of 0.01 and 100 change the pressures of a consolidating column by 1e-5 of the load.
 """
 
 

@@ -24,7 +24,7 @@ ACROSS = "stretch across"
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the body (n,) of each point by its id; starts (bodies + 1,): first id of each body, and of new points.
+    """Return the body (n,) of each point, from its id; starts (bodies + 1,): first id of each body and of new points.
 
     Ids beyond the seeded ones are assigned to the bodies in turn.
     """
@@ -33,14 +33,14 @@ def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F (n,) of (n, d, d); numpy's own, by LU factors, takes twenty times as long."""
+    """Return det F (n,) of F (n, d, d); numpy's function, by LU factors, takes twenty times as long."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
 
 
 def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means (n, d) of corners (n, 2^d, d); numpy's own takes five times as long."""
+    """Return the means (n, d) of corners (n, 2^d, d); numpy's mean takes five times as long."""
     total = corners[:, 0].copy()
     for k in range(1, corners.shape[1]):
         total += corners[:, k]
@@ -70,7 +70,7 @@ def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F F^-T (n, d, d) of (n, d, d), in a tenth of the time of numpy's inverse."""
+    """Return det F F^-T (n, d, d) of F (n, d, d); numpy's inverse takes ten times as long."""
     if F.shape[1] == 2:
         flat = F.reshape(-1, 4)[:, [3, 2, 1, 0]] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
@@ -196,7 +196,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points in the rows (n,) that are true, and in the others another state of the same points."""
+        """Return these points where rows (n,) is true, and another state of the same points elsewhere."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -239,7 +239,7 @@ class MaterialPoints:
 
 
 _ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data"))
-"""Returns all arrays of points outside of `data`."""
+"""Function that returns all arrays of points except `data`."""
 
 
 class PlacedPoints(MaterialPoints):

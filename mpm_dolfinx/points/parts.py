@@ -33,7 +33,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a vector on this process, each with its part.
+    """Entries of a vector on this process, and the part of each entry.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class OfParts:
 
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Order of the entries by parts, first place of each part in it, and the parts with entries."""
+        """Order of the entries by parts, the index of each part's first entry, and the parts with entries."""
         sizes = np.bincount(self.of, minlength=self.count)
         present = sizes.nonzero()[0]
         return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
@@ -118,8 +118,8 @@ def _over_processes(
 ) -> tuple[NDArray[np.int64], int]:
     """Return the parts of cells over all processes, and their number.
 
-    own, count: part of each cell on this process, and number of these parts; nodes, of_node (n,): local numbers of the
-    nodes of the cells, and the part of each node.
+    own: part of each cell on this process; count: number of these parts; nodes (n,): local numbers of the cells' nodes;
+    of_node (n,): part of each node.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

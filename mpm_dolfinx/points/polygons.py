@@ -16,7 +16,7 @@ NONE = -1
 class Polygons:
     """Polygons (n,) of up to k vertices, anti-clockwise.
 
-    x : (n, k, 2), m, vertices, the last one repeated; count : (n,) number of vertices; edge : (n, k) number of the edge
+    x : (n, k, 2) vertices, m, padded by the last one; count : (n,) number of vertices; edge : (n, k) number of the edge
     from each vertex to the next, which cuts preserve.
     """
 
@@ -61,7 +61,7 @@ class Polygons:
         return twice.sum(axis=1) / 2, np.einsum("nk,nki->ni", twice, y + after) / 6
 
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
-        """Return the part of each polygon with normal . x <= level; normal (n, 2), level (n,).
+        """Return the part of each polygon where normal . x <= level; normal (n, 2), level (n,).
 
         The algorithm is that of Sutherland and Hodgman (1974). A new edge has no number.
         """
@@ -99,14 +99,14 @@ class Polygons:
         return _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Divide convex polygons into quadrilaterals, by diagonals with the largest smaller part.
+        """Divide convex polygons into quadrilaterals, by the diagonals that divide them most evenly.
 
-        So no vertex and no direction is preferred.
+        No vertex and no direction is thus preferred.
 
         Returns
         -------
-        The polygon (m,) of each; its vertices (m, 4, 2), of a triangle with the middle of the longest edge; numbers
-        (m, 4) of its edges.
+        Polygon (m,), vertices (m, 4, 2) and edge numbers (m, 4) of each quadrilateral; a triangle also has the middle
+        of its longest edge as a vertex.
         """
         left, rows = self, np.arange(len(self.count))
         found = []
@@ -146,7 +146,7 @@ class Polygons:
         return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], rest)
 
     def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return vertices (n, 4, 2) and numbers of edges (n, 4) of triangles, with the middle of the longest edge."""
+        """Return vertices (n, 4, 2) and edge numbers (n, 4) of triangles, with the middle of the longest edge."""
         size = np.linalg.norm(self.after - self.x, axis=2)
         order = (size.argmax(axis=1)[:, None] + np.arange(3)) % 3
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)

@@ -13,7 +13,7 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 EDGES = 4
 """Number of surface edges in a cell with renewed domains.
 
-Plateau (flow): halved 1.6e-03, doubled 1.5e-03, cells 9.0e-02.
+Plateau (flow): halved 1.6e-03, doubled 1.5e-03, cells 9.0e-02 (relative changes of the result).
 """
 BENT = 1 - 3**0.5 / 2
 """Deviation of the surface from a chord, in cells, that counts as a corner; flatter parts are divided evenly.
@@ -72,7 +72,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area of each of `count` cells, from 0 to 1; 1 for cells without a region."""
+        """Return the filled fraction of the area of each of `count` cells; 1 for cells that are not in `cells`."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -80,7 +80,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return regions (m,), corners (m, 4, 2) of new domains in them, and the faces (m, 4) on the surface."""
+        """Return region (m,) and corners (m, 4, 2) of each new domain, and which faces (m, 4) lie on the surface."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Pressures of cells from the pore water of their pieces, in unsaturated soil.
 
-The content of a volume with storage s and pores n, relative to zero pressure, is c(p) = s pi(p) + n (S(p) - 1) rho(p).
-pi is the mass potential, rho the density over the density at zero pressure.  A piece at another height than the
-centroid of its cell, or of another soil, contributes c(p + o) with its own S and offset o.
+The fluid content of a piece with storage s (m^d/Pa) and pore volume n, less its value at zero pressure, is c(p) = s
+pi(p) + n (S(p) - 1) rho(p).  pi is the mass potential, rho the density relative to zero pressure.  A piece above or
+below its cell's centroid, or of another soil, has c(p + o) with its own S and offset o.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class PoreWater:
     """Water storage of m pieces in n cells.
 
     saturation: function of pressures (m,), Pa, returns S, its slope (m,), 1/Pa, and maybe more; slot (m,): cell of each
-    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: of the fluid, Pa; scale (n,): suction at which pores of a cell
-    drain, Pa.
+    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: fluid's bulk modulus, Pa; scale (n,): suction at which pores of a
+    cell drain, Pa.
     """
 
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]

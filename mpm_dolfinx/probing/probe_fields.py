@@ -185,7 +185,7 @@ class _Around:
         return np.clip(base + fit.values(comm)[:, 0], low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return limits (m,) of the head, Pa: from the probe's cell, its neighbours, and the slope towards a side."""
+        """Return lower and upper bounds (m,) of the head, Pa: heads of cell and neighbours, extrapolated to a side."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):

@@ -47,7 +47,7 @@ The stability function is never below -0.21: an undetected jump overshoots by a 
 AGAIN = 2.0
 """Sudden change, relative to the previous step's at the same rate, up to which it does not count as a jump."""
 MOST = SAME / EPSILON
-"""Most output intervals. Source: exact bound, with more a step's slack SAME is below epsilon times the time."""
+"""Most output intervals. Source: exact bound; with more, the tolerance SAME of a step is below epsilon times t."""
 RESOLVED = 10
 """Smallest `rtol` in units of the solver's tolerance: smaller errors disappear in the solver's."""
 FIRST = 1e-3
@@ -90,7 +90,7 @@ class StepSize:
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, fitted to the time left until the next output."""
+        """Return the length of the next step, s: `small`, adjusted to end a step at the output after `left`, s."""
         if self.by_error:  # no tiny step before an output
             small = min(small, self.longest)  # it may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)

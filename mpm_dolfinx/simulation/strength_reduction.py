@@ -4,9 +4,9 @@
 A factor F divides cohesion, tensile strength and the tangents of the angles of friction and dilation (Griffiths and
 Lane 1999). Dilation is divided too, so that associated flow stays associated. Soil that is too weak has no equilibrium,
 but a solver without convergence says nothing about the soil. Each trial therefore advances in time against a viscous
-stress. The criterion is the overload: the fraction of the shear stress, in moving soil, that the viscous stress bears.
-In a body that comes to rest, the soil's strength takes over the load, and the overload vanishes. In a slide it stays:
-it is the missing strength, whatever the viscosity and the cell size.
+stress. The criterion is the overload: the viscous stress, as a fraction of the shear stress in the moving soil. In a
+body that comes to rest, the soil's strength takes over the load, and the overload vanishes. In a slide it stays: it is
+the missing strength, whatever the viscosity and the cell size.
 
 All trials start from the stresses of soil with unlimited strength. Bodies at rest have such stresses. Bodies that were
 not run, because they cannot stand, reach them in an elastic step.
@@ -47,10 +47,10 @@ if TYPE_CHECKING:
 WIDER, WIDEST = 2**0.5, 16.1
 """Ratio of successive trial factors until one rests and one slides; largest ratio to 1."""
 LACKS = 0.25
-"""Largest overload of a trial at rest, over `rtol`.
+"""Largest overload of a trial at rest, divided by `rtol`.
 
-The initial overload is 0.9 of the missing strength in a uniform block, and 0.6 in a slope; at the end of a sliding
-trial it is half of that. With an eighth and a half the slope's factor differs by 1.1 and 0.5 %.
+A trial that slides starts at an overload of 0.9 of the missing strength in a uniform block, and of 0.6 in a slope. Its
+overload halves until the end. With 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
 """Strain in a trial of a marginal slide, in elastic strains at yield; in overloads at most.
@@ -86,7 +86,7 @@ class Safety:
 def factor_of_safety(
     simulation: Simulation, *, dt: float | None = None, rtol: float = 0.01, steps: int = 10, progress: bool = True
 ) -> Safety:
-    """Return the factor of safety by strength reduction: bodies slide when their strength is divided by more than it.
+    """Return the factor of safety by strength reduction: the largest divisor of the strength without failure.
 
     The simulation is unchanged. A scene that cannot stand needs no run: trials start from an elastic step of dt. The
     call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided. The factor
@@ -298,7 +298,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step over that of the shear stress, by magnitude.
+        """Return the work of the viscous stress in a step, divided by the work of the shear stress, by magnitude.
 
         Points that moved to another process are left out.
         """

@@ -36,7 +36,7 @@ class Tangent:
     x : (n, d)
         Position of the node, m.
     pressure, content, storage : (n, m), (m, n), (m, m)
-        Blocks of the pressures, without the derivative of fluxes by displacements.
+        Blocks of the pressures, without the derivative of fluxes with respect to displacements.
     cells : (m,)
         Cell of each pressure.
     """

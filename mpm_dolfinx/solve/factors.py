@@ -33,7 +33,7 @@ from mpm_dolfinx.solve.petsc_options import set_defaults
 from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 
 MOST = 500
-"""Most iterations of a linear solve, and size of its Krylov space: there is no restart.
+"""Largest number of iterations of a linear solve, and size of its Krylov space: there is no restart.
 
 With PETSc's restarts after 30, FGMRES stagnates where the tangent of a footing is nearly singular: solves that end
 after 500 iterations take 50. Vectors are allocated on demand.

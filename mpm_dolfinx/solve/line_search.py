@@ -6,8 +6,8 @@ first order. It is halved while a law cannot be evaluated at its end, or the res
 
 In yielding soil the step is full if the residual falls, or if the forces at its end do less than half of the initial
 work along it. Otherwise the search ends where they do about none (Matthies and Strang 1979). Points that the step
-unloads leave their yield surface there, and the next tangent is as stiff as they are. The work includes that of the
-fluid: the work of the forces alone nearly vanishes where these are in equilibrium and the fluid is not. Shorter steps
+unloads leave their yield surface there, and the next tangent is as stiff as they are. The work includes the fluid's
+work: the work of the forces alone nearly vanishes where these are in equilibrium and the fluid is not. Shorter steps
 with smaller residuals would lead to more short steps. Bracketed secants find the point. Soil that has lost its strength
 needs several: with one, a slumping bank takes twice the Newton steps.
 
@@ -36,9 +36,9 @@ EXPLODES, SHORTEST = 1e4, 1e-3
 With 1e3 and 1e5 scenes take the same steps: the growth is below them, or the residual not finite.
 """
 WORK = 0.5
-"""Largest work at the end of a step, over that at its start (Matthies and Strang 1979)."""
+"""Largest work at the end of a step, divided by the work at its start (Matthies and Strang 1979)."""
 FIRM = 0.1
-"""Fraction of the elastic shear stiffness in the tangent of yielding soil, over the relative residual, at most 1.
+"""Fraction of elastic shear stiffness in the tangent of yielding soil, per unit of relative residual, at most 1.
 
 With 0.05 and 0.2 a footing on 9 cells takes 291 and 293 Newton steps, pushed ground 42 and 43, with 0.1 293 and 41.
 """
@@ -60,9 +60,9 @@ class Halving:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step at whose end the residuals do less than half of the initial work.
+    """Search for a step with less than half of the initial work of the residuals at its end.
 
-    step: the next trial; low, high: steps between which the work changes its sign; at_low, at_high: work there over the
+    step: the next trial; low, high: steps between which the work changes its sign; at_low, at_high: work there /
     initial work; ends: whether the next step is the last one.
     """
 
@@ -78,8 +78,8 @@ class Search:
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next trial after one with this relative work, nan if it is not finite; None: the search has ended.
 
-        growth: of the residual. A full step that does not increase the residual may end with up to the initial work. A
-        secant gives the next trial; bisection does where a bound stays for a second time.
+        growth: growth of the residual. A full step that does not increase the residual may end with up to the initial
+        work. A secant gives the next trial; bisection gives it where a bound stays for a second time.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

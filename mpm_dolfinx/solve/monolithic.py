@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both linearised problems at once, where factors of K are too expensive: large bodies in 3D, larger ones in 2D.
+"""Both linearised problems at once, where a direct solver is too expensive: large bodies in 3D, larger ones in 2D.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
@@ -19,9 +19,9 @@ to 6 iterations). Four steps of yielding soil, 12^3 cells, take 33 and 41 s. MUM
 8610 in 1.4 s (PETSc in 3.4 s). No solve takes more than 19 then, nor more than 22 at nu = 0.49 with contrasts of 1e3.
 
 In 2D yielding soil would take 20 to 500 (a footing on 41 cells, with any smoother). Shear bands are one cell wide, and
-coarse grids cannot represent them. With a viscosity of 0.05 it takes 28, and on 41 cells a tenth less time than
-factors, but on 81 cells 1.7 times as much. Moving the volumetric stiffness of K to the storage, p -> p + k B u, leaves
-K as at nu = 0.3, but alternating pressures become almost free: 500 iterations.
+coarse grids cannot represent them. With a viscosity of 0.05 it takes 28. Its time is 0.9 times that of a direct solver
+on 41 cells, but 1.7 times on 81. Moving the volumetric stiffness of K to the storage, p -> p + k B u, leaves K as at nu
+= 0.3, but alternating pressures become almost free: 500 iterations.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid, over the fluid volume that the residual forces would displace in a drained body.
+"""Smallest scale of the fluid / fluid volume that the residual forces would displace in a drained body.
 
 Sealed bodies exchange nearly no fluid: with scales that differ by 5e5 rounding left 2e-5 of a residual.
 """
@@ -68,7 +68,7 @@ class BlockOperator:
     scale
         Scales of the rows of both problems.
     slopes
-        Derivative of the fluxes by displacements, if it is included.
+        Derivative of the fluxes with respect to displacements, if it is included.
     """
 
     momentum: MomentumSystem
@@ -99,7 +99,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return the fluid volume that the residual forces displace in each part, over their norm (parts,), m^d/N."""
+        """Return (fluid volume displaced by the residual forces) / (their norm) of each part (parts,), m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -174,7 +174,7 @@ class BlockSolver:
         rtol
             Tolerance relative to the norm of both scaled residuals, in each part.
         slopes
-            Derivative of the fluxes by displacements, if it is included.
+            Derivative of the fluxes with respect to displacements, if it is included.
         factors
             Factors in place of the cycles so far.
 

@@ -34,10 +34,10 @@ OPTIONS = {
     "mg_levels_pc_type": "sor",
 }
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
-"""Smoothing for nearly incompressible bodies where factors may not replace the cycles.
+"""Smoother for nearly incompressible bodies where a direct solver must not replace multigrid.
 
-Two steps of a cube of 14^3 cells with layers of 1 : 1000 at nu = 0.49, without factors, take 126 iterations a solve (by
-GAMG 112); with a single sweep GMRES fails. With factors both take as long.
+Test without a direct solver: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. A solve takes 126
+iterations, by GAMG 112; with a single sweep GMRES fails. With a direct solver both smoothers take the same time.
 """
 MAYBE, NOT, IS = 0, 1, 2  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -62,7 +62,7 @@ def multigrid_solver(
     A
         The matrix, which may still be empty.
     name
-        Prefix of its options.
+        Prefix of the solver's options.
     places : (n, d + 1)
         Rows of this process: indices along the axes of the grid, >= 0, and kind, >= 0. Kinds are not mixed.
     held : (m, d + 1)
@@ -70,7 +70,7 @@ def multigrid_solver(
     nodal
         Whether the unknowns belong to nodes.
     coarsest
-        Unknowns of a grid up to which factors solve on it.
+        Largest number of unknowns of a grid with a direct solver.
     firmly
         Whether to smooth three times as often: see `FIRMLY`.
     lines : (n,) along each axis, m
@@ -186,7 +186,7 @@ def _shared(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers (n,) of coarse unknowns, NONE for others, and whether this process owns them (n,).
 
-    The process of least rank that asks for an unknown owns it. Keys are distributed over processes to find owners and
+    The lowest-ranked process that asks for an unknown owns it. Keys are distributed over processes to find owners and
     numbers.
 
     Parameters

@@ -13,8 +13,8 @@ A Newton step of the two problems reads
 fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: less beta V for pressures that alternate
 from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly
 unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: in turn, a storage solve
-with C + beta V at frozen stress, and a momentum solve. Where factors of K are too expensive, in large bodies, multigrid
-is used. `schur-...` then solve both problems at once, see `monolithic`.
+with C + beta V at frozen stress, and a momentum solve. Where a direct solver is too expensive, in large bodies,
+multigrid is used. `schur-...` then solve both problems at once, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ REBALANCED = 6  # total iterations with changing contacts, in units of the most 
 LOOSEST = 1e-2
 """Largest residual after a linear solve, relative to that before it.
 
-Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02.
+Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02 (relative changes of the result).
 """
 SOLVED = 0.05
 """Residual after the last linear solve, relative to the tolerance.
 
-Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02.
+Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02 (relative changes of the result).
 """
 SETTLED = 1e-2  # residual below which slipping contacts may stick: above it the contact area still changes
 ERROR = 1 / 20
@@ -64,7 +64,7 @@ rise or oscillate, 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e lat
 step of a load that grows from zero, 0.26 e after a jump. The largest error of a run is thus 0.7 to 5 times this.
 """
 SUDDEN = np.sqrt(2)
-"""Change in the second substep over that in the first below which pressures decay so fast that sdirk2 overshoots.
+"""Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
 
 The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2), where the changes
 are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). Pressures that follow the loads have (1 - gamma) / gamma.
@@ -79,8 +79,8 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 class Errors:
     """Relative residuals of momentum and storage in the parts of the bodies; arrays (parts,).
 
-    u, p: relative residuals; forces: scale of the first, N; exchanged: scale of the second, the exchanged fluid volume,
-    m^d; start: forces at the start of the step, N; fluid: residual of the storage.
+    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, the exchanged fluid
+    volume, m^d; start: forces at the start of the step, N; fluid: residual of the storage.
     """
 
     u: NDArray[np.float64]
@@ -92,7 +92,7 @@ class Errors:
 
     @cached_property
     def each(self) -> NDArray[np.float64]:
-        """The larger residual of each part."""
+        """The larger of both residuals of each part."""
         return np.maximum(self.u, self.p)
 
     @cached_property
@@ -164,7 +164,7 @@ def note_pressures(
 ) -> None:
     """Note pressure changes of a step in its report, and the estimated error of the step.
 
-    The difference between the step and one of first order is seconds (Q2 - Q1), a fluid volume. The fixed-stress
+    The difference between the step and a first-order step is seconds (Q2 - Q1), a fluid volume. The fixed-stress
     operator turns it into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996). Cells are
     weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
@@ -314,7 +314,7 @@ class Newton:
         """Refuse an unstable equilibrium: smaller steps find the path that leaves it.
 
         Its tangent has negative eigenvalues. The check is for dry bodies only, because water delays buckling. If a step
-        has kept its first tangent, the next step finds out.
+        has kept its first tangent, the next step makes the check.
         """
         if not negative_pivots(self._solvers.solve_u):
             return
@@ -404,8 +404,8 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem; return the coupling iterations.
 
-        slow: whether the last step converged slowly with its own tangent, which lacks the derivative of fluxes by
-        displacements.
+        slow: whether the last step converged slowly with its own tangent, without the derivative of fluxes with respect
+        to displacements.
         """
         # no more accurate than the next residual needs
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing

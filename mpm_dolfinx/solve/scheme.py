@@ -31,7 +31,7 @@ class Scheme:
     tolerance
         Tolerance of both residuals, relative to the forces and to the exchanged fluid volume; in (0, 1).
     most_newton, most_coupling
-        Most Newton steps, or coupling iterations of `fixed-stress`, in a step.
+        Largest number of Newton steps, or coupling iterations of `fixed-stress`, in a step.
     petsc_options
         PETSc's options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
         `petsc_options.PREFIXES`. A warning lists options that no solver of the scene reads.

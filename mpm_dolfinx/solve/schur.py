@@ -40,7 +40,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan of problems with these matrices; symmetric: whether the momentum's tangent is."""
+    """Return the solver plan of problems with these matrices; symmetric: whether K is symmetric."""
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
@@ -67,7 +67,7 @@ class SchurComplement:
     f, v
         Two displacement vectors.
     slopes
-        Derivative of the fluxes by displacements, if it is included.
+        Derivative of the fluxes with respect to displacements, if it is included.
     """
 
     storage: StorageSystem
@@ -96,7 +96,7 @@ class Kept:
     operator
         Whether the factors of the fixed-stress operator are still valid.
     factors
-        Factors that replace multigrid cycles, if any.
+        Direct solver that replaces multigrid, if any.
     """
 
     operator: bool = False
@@ -122,7 +122,7 @@ class LinearSolvers:
         self._momentum = momentum
         self._storage = storage
         self.tangent: Latest[bool] = Latest()
-        """Key of a tangent that the matrices keep over steps."""
+        """Key of a tangent that the matrices keep from step to step."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
         """Direction of the displacements, and a right-hand side."""
@@ -249,7 +249,7 @@ class LinearSolvers:
         forces, exchanged : (parts,)
             Scales of the residuals: forces, N, and exchanged fluid volume, m^d.
         slope
-            Derivative of the fluxes by displacements, if the tangent includes it.
+            Derivative of the fluxes with respect to displacements, if the tangent includes it.
         """
         slopes = () if slope is None else (slope,)
         if self._storage is None:

@@ -21,26 +21,26 @@ class Thresholds:
     """Thresholds between routes; `bash demos/run.sh calibrate` times both sides of each.
 
     multigrid_3d
-        Unknown displacements in 3D from which multigrid solves. Five load steps of a square beam take, by factors and
-        by multigrid, s: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4 with 2600, 8.2 and 2.1 with 4900.
+        Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take, with
+        a direct solver and multigrid, s: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4 with 2600, 8.2 and 2.1 with 4900.
     multigrid_2d
         The same in wet 2D scenes without yield. Linear algebra of a step of the beam takes, s: 0.06 and 0.05 with 10400
         unknowns, 0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
     mumps
-        Unknown displacements of wet unsymmetric problems from which MUMPS makes factors, on all processes. Factors of K
+        Number of unknown displacements of wet unsymmetric problems from which MUMPS is used, on all processes. Factors
         and a solve take, with 196000 unknowns, s: PETSc 2.6 and 0.02, MUMPS with OpenBLAS 0.7 and 0.09; with 51000
         unknowns 0.25 and 0.004, 0.12 and 0.02. A Newton step takes five to ten solves.
     gathering
-        Most processes with which one holds the factors for many solves. Making both factors on all of four processes,
-        which share the memory's bandwidth, took 1.7 times as long.
+        Largest number of processes with which one of them holds the factors for many solves. Making both factors on all
+        of four processes, which share the memory's bandwidth, took 1.7 times as long.
     fallback_3d
-        Most unknown displacements in 3D with which factors may replace cycles. MUMPS takes 8 s and 0.2 GB for this
-        number, with unsymmetric K 15 s and 0.4 GB.
+        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
+        and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
-        Iterations of a solve after which factors replace the cycles, or the next tangent renews the factors of the
-        fixed-stress operator. The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
+        Iterations of a solve after which a direct solver replaces multigrid, or the next tangent renews the factors of
+        the fixed-stress operator. The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
     coarsest
-        Unknowns of a grid up to which factors solve on it.
+        Largest number of unknowns of a grid with a direct solver.
     """
 
     multigrid_3d: int = 1500
@@ -56,19 +56,19 @@ THRESHOLDS = Thresholds()
 FORCING = 1e-5
 """Tightest relative tolerance of a linear solve.
 
-Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02.
+Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02 (relative changes of the result).
 """
 FORCING_3D = 1e-3
-"""The same for multigrid in 3D."""
+"""Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
 """Largest ratio of successive residuals at which the tangent is kept for the next step.
 
-Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02.
+Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
 """
 KEEP_WET = 0.01
 """The same in wet 2D scenes without yield.
 
-Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02.
+Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02 (relative changes of the result).
 """
 
 
@@ -83,11 +83,11 @@ class SolverPlan:
     displacements, pressures
         Solvers for K and for the fixed-stress operator; pressures is "" without fluid.
     krylov
-        PETSc's name of the iterative solver, "preonly" for factors alone.
+        PETSc's name of the iterative solver, "preonly" for a direct solver alone.
     fallback
-        Factors that replace a cycle on K after many iterations; "" for none.
+        Direct solver that replaces a multigrid cycle on K after many iterations; "" for none.
     firmly
-        Whether cycles smooth three times as often: for nearly incompressible bodies without a fallback.
+        Whether multigrid smooths three times as often: for nearly incompressible bodies without a fallback.
     gathered
         Whether one process holds the factors.
     symmetric
@@ -95,7 +95,7 @@ class SolverPlan:
     many
         Iterations of a solve after which new factors are made: see `Thresholds`.
     coarsest
-        Unknowns of a grid up to which factors solve on it.
+        Largest number of unknowns of a grid with a direct solver.
     forcing
         Tightest relative tolerance of a linear solve; see `plan`.
     keep
@@ -156,13 +156,13 @@ def plan(
     Parameters
     ----------
     unknowns
-        Displacements, of all processes.
+        Number of unknown displacements on all processes.
     dim
         2 or 3.
     wet
         Whether there is fluid.
     yields, locks
-        Whether any law may yield; whether any yields or is nearly incompressible.
+        Whether any law may yield; whether any law may yield or is nearly incompressible.
     symmetric
         Whether the tangent of the momentum is symmetric.
     processes

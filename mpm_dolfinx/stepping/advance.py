@@ -52,7 +52,7 @@ pressures of a manufactured solution converge with less than order 1.75. Without
 does not affect the order in time. The mean of drained parts must stay: a column under a varying gravity then has order
 1.2 in the step.
 
-Plateau (beam): halved 1.7e-03, doubled 2.8e-03, cells 1.5e-02.
+Plateau (beam): halved 1.7e-03, doubled 2.8e-03, cells 1.5e-02 (relative changes of the result).
 """
 
 
@@ -219,7 +219,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the mean of Delta F over the pieces, with the mean of det.
 
-        Its shape is that of the laws' F.
+        It has the shape of the laws' F.
         """
         pieces = data.pieces
         grid = cut.grid

@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Acting(NamedTuple):
-    """Loads of a substep: its weights, time, s, loads, and gravity (d,), m/s^2, if any."""
+    """Loads of a substep; substep: time weights; t: end of the substep, s; gravity (d,): m/s^2, or None."""
 
     substep: Substep
     t: float
@@ -84,7 +84,7 @@ class Balances(NamedTuple):
     inertia: Inertia | None = None
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
-        """Return the velocities after a solved substep of a step of dt (s); None without inertia."""
+        """Return the velocities at the end of a solved substep; None without inertia; dt: length of the step, s."""
         if self.inertia is None:
             return None
         acceleration = self.inertia.acceleration(self.momentum.at)
@@ -97,7 +97,7 @@ class Balances(NamedTuple):
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
         """Return the outcomes of the conditions at the end of a step, see `State`.
 
-        passed, seconds: flows of the substeps, see `passing`, and the time weights, s, of the last ones.
+        passed: flow in each substep, see `passing`; seconds: time weights, s, the last ones for the flows in `passed`.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])

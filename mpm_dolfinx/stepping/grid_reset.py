@@ -325,7 +325,7 @@ class OnGrid(Keyed):
     ) -> CellPressures:
         """Return the data for slopes of cell pressures p (cells,), Pa, in terms of their mass potentials.
 
-        bulk: of the fluid, Pa; at_rest: hydrostatic pressures, which are subtracted.
+        bulk: bulk modulus of the fluid, Pa; at_rest: hydrostatic pressures, which are subtracted.
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)

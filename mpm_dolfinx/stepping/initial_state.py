@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The initial state: given stresses and pore pressures, balanced with the loads.
 
-Given stresses and the scheme's error leave out-of-balance forces. Steps of the momentum at fixed pressures remove
-these. Their deformation adds to the elastic strain of the points, whose positions do not change.
+Given stresses and the scheme's error leave out-of-balance forces. Steps of the momentum balance at fixed pressures
+remove these forces. Their deformation adds to the elastic strain of the points, whose positions do not change.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def balanced(scene: Scene, state: State) -> State:
 
     A displacement w of the grid is balanced with the strains of the pieces; points keep the mean strain of their
     domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes: nodal forces hold the remainder, `State.held`. Supports have their force at the
-    displacement w, `State.rest`: they hold the sides at the seeded positions, whatever is prescribed at the start.
+    strains cannot balance all nodes: nodal forces hold the remainder, `State.held`. Support forces are evaluated at the
+    displacement w, `State.rest`: the sides keep their seeded positions, whatever is prescribed at the start.
 
     Raises
     ------

@@ -45,10 +45,10 @@ class Result:
     converged
         Whether the end has been reached.
     event
-        Number of the function of `until` that ended the run, from 0, and time, s; None without an event.
+        Index in `until`, from 0, of the function that ended the run, and its time, s; None if none did.
     points, memory, imbalance
-        At the end of the run: material points, peak memory of all processes with libraries, MB, and the largest load of
-        a process over the mean.
+        Values at the end of the run: material points; peak memory of all processes with libraries, MB; (largest load of
+        a process) / (mean load).
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -138,9 +138,9 @@ class Result:
 
         kinetic and elastic belong to the bodies and free tools; elastic is 0 for laws without an energy. The others
         count from the start of the run: external is the work of all loads, viscous the work on quiet sides and
-        user-defined terms, friction that of slip on tools and between groups, internal that of the stresses; dissipated
-        is the part of internal that is not elastic, in wet bodies with the work of flow and storage of water. kinetic +
-        elastic + dissipated + viscous + friction - external is constant, up to losses of the method.
+        user-defined terms, friction the work of slip on tools and between groups, internal the work of the stresses;
+        dissipated is the part of internal that is not elastic, in wet bodies with the work of flow and storage of
+        water. kinetic + elastic + dissipated + viscous + friction - external is constant, up to losses of the method.
         """
         return self.outcome("energy")
 

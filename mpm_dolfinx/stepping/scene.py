@@ -200,9 +200,9 @@ class Scene:
             self._warned.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
-        """Set the fluid's weight for the pressure variation within cells of unsaturated soil, see `Retentions`.
+        """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        It belongs to a stage at the time, s, at the start of a step; a varying gravity resets the grid in each step.
+        It is the weight in `stage` at the start t (s) of a step; a varying gravity resets the grid in each step.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None

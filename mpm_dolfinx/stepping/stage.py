@@ -86,8 +86,8 @@ class Stage:
 
     given: conditions by name, as they were given; named: the same, with the unit weight of water from the pore fluid;
     conditions: walls, including the axis, and gravity; present: whether each body is present; later: bodies that may
-    still be added; free: (nodes, d), components that no wall fixes; axisymmetric: as the grid; lattices: of the bodies
-    that are present; materials: of the scene; acting: loads on the momentum; feeding: conditions on the fluid.
+    still be added; free (nodes, d): components that no wall fixes; axisymmetric: see `Grid`; lattices: lattices of
+    present bodies; materials: the scene's; acting: loads on the momentum; feeding: conditions on the fluid.
     """
 
     given: Mapping[str, Condition]

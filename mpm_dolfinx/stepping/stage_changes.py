@@ -79,11 +79,11 @@ def begin_stage(
     """Return the state at the beginning of a stage: see `Simulation.stage`; named: the new conditions."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
-        raise ValueError("gravity: the scene has none, must be created with gravity=(0, 0)")
+        raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
     if "inertia" in named:
         flag("stage: inertia", named["inertia"])
         if scene.momentum.inertia is None:
-            raise ValueError("stage: inertia: the scene has none, must be created with inertia=False")
+            raise ValueError("stage: inertia: the scene has none; for changes it must be created with inertia=False")
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are still to be added")
     flag("stage: reset_displacement", reset_displacement)
@@ -97,7 +97,7 @@ def begin_stage(
         _warn_moved_on(scene, before, begun)
     new_quiet = {name: one for name, one in begun.of(Quiet).items() if name not in begun.same(before)}
     if new_quiet and before.inertia:
-        raise ValueError(f"{next(iter(new_quiet))}: bodies had inertia before, must be quiet from its first stage on")
+        raise ValueError(f"{next(iter(new_quiet))}: must act from the first stage in which its bodies have inertia")
     state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
     state = scene.followed(state)

@@ -48,7 +48,7 @@ class _Rings:
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
     def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the nominal stresses (n, 2), Pa, and their derivatives by the stretches (n, 2, 2)."""
+        """Return the nominal stresses (n, 2), Pa, and their derivatives with respect to the stretches (n, 2, 2)."""
         nudges = SAME * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
         P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)
@@ -63,8 +63,8 @@ class _Rings:
 class Cavity:
     """A ring of soil in plane strain, with linear elements of one point each, under inner and outer pressure.
 
-    rings: the law; R, r: radii of the nodes at the start and now; state: of the law; far: pressure outside, Pa;
-    pressure: that in the hole, Pa.
+    rings: the law; R, r: radii of the nodes at the start and now, m; state: state of the law; far: outer pressure, Pa;
+    pressure: pressure in the hole, Pa.
     """
 
     rings: _Rings

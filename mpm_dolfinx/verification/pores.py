@@ -37,8 +37,8 @@ class Pores:
     def between(self, p0, p1):
         """Return the mean of k_r over the pressures between two as UFL.
 
-        Its points of integration lie evenly on the scale of `retention.logarithm`: on that of the pressure all of them
-        would be dry between a wet cell and a very dry one.
+        Its points of integration lie evenly on the scale of `retention.logarithm`. On the scale of the pressure all of
+        them would be dry between a wet cell and a very dry one.
         """
         if self.law is None:
             return 1.0
