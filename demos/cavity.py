@@ -49,7 +49,7 @@ def well() -> mpm.ModifiedCamClay:
 
 @dataclass(frozen=True)
 class Drained:
-    """A drained cavity in soil without end.
+    """A drained cavity in infinite soil.
 
     soil, state: with the state that it begins with; known: radius -> pressure over p_0; reach: of the radial solution.
     """

@@ -64,7 +64,7 @@ class Dam:
         self.balance = max(self.balance, result.balance)
 
     def see(self, simulation: mpm.Simulation) -> None:
-        """Keep the present flows, corners and pressures."""
+        """Record the present flows, corner positions and pressures."""
         self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
@@ -109,7 +109,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
 
 def rectangular(cells: int) -> float:
-    """Return the flow through a rectangular dam over the exact one."""
+    """Return the ratio of the flow through a rectangular dam to the exact flow."""
     levels, width, top = (10.0, 2.0), 9.6, 12.0
     h = top / cells
     grid = mpm.Grid([0, 0], [width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])

@@ -6,8 +6,8 @@ material points vary.  The finite elements are body-fitted: Q1/DG0 on the same g
 shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged in space
 and in time.
 
-* beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, and from 0.1 s on.  The
-  reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
+* beam: the poroelastic beam; largest error of the tip deflection over all output times `beam.TIMES`, and over those
+  from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
 * drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
 * terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
 * column: height of the soft column under its own weight, exact

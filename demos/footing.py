@@ -28,8 +28,9 @@ cells, laws therefore use half of the deviation of the gradient from its mean: -
 
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 
-With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside of it, cells grow by a tenth from one to the
-next, up to eight times.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B with fine cells only.
+With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside it, each cell is a tenth longer than the one
+before, up to eight times the length of the smallest.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x
+2.5 B with fine cells only.
 
 With non-associated flow the answer is not unique.  Shear bands one cell wide jump from place to place, more
 so with finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a resistance to the
@@ -210,7 +211,7 @@ def push(
 def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
     """Push the footing into very stiff soil; its loads are relative to theory.
 
-    box, graded: see `push`; by default that of `LIMITS_OF`, of equal cells.
+    box, graded: see `push`; by default the box of `LIMITS_OF` with equal cells.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own

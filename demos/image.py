@@ -164,7 +164,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, tissue: Tissue, out: Outcome) -> None:
-    """Draw the picture, the pressure when the load has come, the tissue in the end, and both over time."""
+    """Plot the image, the pore pressure at full load, the drained tissue, and the histories of settlement and pressure."""
     fig, (axes, below) = common.figure(2, 3, (13, 7.6))
     mm, (loaded, last) = 1e3 * EDGE, out.frames
     grey = np.where(tissue.grey < HOLES, np.nan, tissue.grey)

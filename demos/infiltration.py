@@ -67,7 +67,7 @@ def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> 
 
 
 def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
-    """Return heights and heads of the cells at the hours, the errors, and whether the run has converged."""
+    """Return the cells' heights and heads at each of `HOURS`, the errors, and whether the run converged."""
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=K, retention=mpm.Gardner(WEIGHT / ALPHA))
     sides = [mpm.Drained("bottom"), mpm.Rain("top", 0.9 * K)]
     s = column(cells, soil, lambda x: WEIGHT / ALPHA * np.log(0.1 + 0.9 * np.exp(-ALPHA * x[:, 1])), sides)

@@ -44,7 +44,7 @@ BALANCE = 0.01  # share of the work of the weight by which energies may be off
 
 
 def column(cells: int) -> mpm.Simulation:
-    """Return the column at rest with cells across the slope, and its foot at the water table."""
+    """Return a column normal to the slope, `cells` cells high, at rest, with its base at the water table."""
     height = TABLE * np.cos(SLOPE)
     h = height / cells
     grid = mpm.Grid([0, 0], [h, height + 2 * h], [1, cells + 2])

@@ -21,8 +21,8 @@ With runs on one and on several processes, a cost model is fitted to the seconds
 
 a fixed cost, work of the points (of a run, times its imbalance), halo, and messages of any size.  All terms are >= 0,
 by least squares of relative errors.  H is the number of points along the faces between processes, for a cube that is
-halved repeatedly.  Runs on more processes than processors count for messages only.  In 2D the solvers are left out:
-the cost of factorisations is not n / P.
+halved repeatedly.  If a run has more processes than the machine has processors, its message counts are used, but not
+its times.  In 2D the solvers are left out: the cost of factorisations is not n / P.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def end_of(kind: str, R: float) -> float:
 
 
 def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
-    """Return by how much the sand's ends are off Mohr and Coulomb's surface, over the cell pressure."""
+    """Return the distance of the final stresses of the sand from the Mohr-Coulomb surface, over the cell pressure."""
     out = {}
     for strain, r in tests.items():
         tau = np.sort(np.diag(r.stress[-1])) * np.linalg.det(r.F[-1])

@@ -60,7 +60,7 @@ def decades(low: int, high: int, step: int = 1) -> list[float]:
 
 @family(0.01)
 def conductivity():
-    """Beam that drains at its end, k = 1e-14 ... 1e2 m/s: tip, finite elements."""
+    """Beam that drains at its end, k = 1e-14 ... 1e2 m/s: tip against finite elements."""
     for k in decades(-14, 2):
         yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
 
@@ -207,7 +207,7 @@ def held(s: mpm.Simulation) -> float:
 
 @cache
 def half_drained() -> float:
-    """Return the mean pressure at the end on a fine grid that the square fits."""
+    """Return the final mean pressure on a fine grid whose lines coincide with the sides of the square."""
     scene = square(0, None, **{**DRAINING, "cells": 48})()
     scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
     return held(scene.simulation)
@@ -236,7 +236,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Beam and column that stick 1e-10 ... 0.5 of a cell into the next: tip, finite elements; settlement, exact."""
+    """Beam and column whose last cell is filled to 1e-10 ... 0.5: tip against finite elements, exact settlement."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
