@@ -164,7 +164,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, tissue: Tissue, out: Outcome) -> None:
-    """Plot the image, the pore pressure at full load, the drained tissue, and the histories of settlement and pressure."""
+    """Plot the image, the pressure at full load, the drained tissue, and settlement and pressure over time."""
     fig, (axes, below) = common.figure(2, 3, (13, 7.6))
     mm, (loaded, last) = 1e3 * EDGE, out.frames
     grey = np.where(tissue.grey < HOLES, np.nan, tissue.grey)
