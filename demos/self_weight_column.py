@@ -31,7 +31,7 @@ FOAM = mpm.Hencky(bulk=EXACT.bulk, shear=EXACT.shear, porosity=POROSITY, grain_d
 
 @dataclass
 class Outcome:
-    """The column at rest: heights Y before and y now (n,), m, vertical stress (n,), Pa, and volume0 of the points."""
+    """The column at rest: initial heights Y and present ones y (n,), m, stress (n,), Pa, and volume0 of the points."""
 
     Y: np.ndarray
     y: np.ndarray
