@@ -312,7 +312,10 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity, relative to c times the duration of a push, s.  It is the additional resistance over c at a shear strain of 1 in this duration."""
+    """Return the soil with a viscosity, relative to c times the duration of a push, s.
+
+    It equals the additional resistance over c at a shear strain of 1 in this duration.
+    """
     if viscosity == 0:
         return SOIL
     own = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)} | {"residual": COHESION, "slip": WIDTH}  # none softens

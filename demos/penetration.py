@@ -65,7 +65,7 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between domains, 0 ahead of the bar, where widths are `nose` times those of the others."""
+    """Return the angles between domains; ahead of the bar, at 0, widths fall to `nose` times those of the others."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -133,7 +133,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar at y over D by a distance over D, from given stresses or the loaded clay; return the final stresses."""
+    """Push a bar at y over D by a distance over D, from given stresses or the loaded clay; return final stresses."""
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
@@ -246,7 +246,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar through lines that follow it; return its resistance and number of cells, over those with equal cells."""
+    """Push a bar through lines that follow it; return resistance and number of cells, over those with equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))

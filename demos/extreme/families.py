@@ -394,7 +394,10 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 
 @family(1e-4)
 def layered_rain():
-    """Two layers, off the grid lines, in rain, ratio of k 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: exact heads; also in axisymmetry and 3D."""
+    """Two layers, off the grid lines, in rain, ratio of k 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: exact heads.
+
+    Also in axisymmetry and 3D.
+    """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):
             for other in (0.1, 10.0):
