@@ -108,7 +108,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the deformed axes and those of the rod, and the tips and those of the elastica."""
+    """Draw the deformed axes of beam and rod, and the tips of beam and elastica."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.8))
     for i, (alpha, axis) in enumerate(out.axis.items()):
         left.plot(*rod(alpha).T, color="black", lw=1, label=None if i else "shear-flexible rod")

@@ -2,7 +2,7 @@
 """Columns of dry sand collapse: run-out and height against published experiments, and energies.
 
 Columns of width L and height a L, a = 0.5, 1, 4 and 8, stand against a smooth wall on a rough floor.  Their right side
-is released at once.  Lube et al.  (2005) found for sand, sugar and rice in a channel, with angles of repose near 31
+is released at once.  Lube et al. (2005) found for sand, sugar and rice in a channel, with angles of repose near 31
 degrees, that the front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
 
 The sand follows Mohr and Coulomb's law without dilation.  In simple shear it bears sin phi of the normal stress (Davis

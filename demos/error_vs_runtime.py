@@ -6,7 +6,7 @@ material points vary.  The finite elements are body-fitted: Q1/DG0 on the same g
 shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged in space
 and in time.
 
-* beam: the poroelastic beam; largest error of the tip deflection over all output times `beam.TIMES`, and over those
+* beam: the poroelastic beam; largest error of the tip deflection over all output times `beam.TIMES`, and over the times
   from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
 * drained: the same beam without water, load in ten steps; error of the tip against 67 x 20 Taylor-Hood elements
 * terzaghi: settlement at T_v = 0.5, against the exact one;  mandel: settlement of the plate at T = 0.1, exact

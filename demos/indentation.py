@@ -139,7 +139,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
-    """Draw initial pore pressures, pressures under the cylinder with those of Hertz, and the force over time."""
+    """Draw initial pore pressures, pressures under the cylinder with Hertz's solution, and the force over time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")

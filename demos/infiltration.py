@@ -3,8 +3,8 @@
 
 Left: rain on exponential soil (`Gardner`) above a water table.  The rain is a tenth of the conductivity until t = 0,
 and nine tenths of it after that.  Heads are compared with the series of Srivastava and Yeh (1991).  Right: a wetting
-front from a wet surface into dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990), against a
-converged solution of Richards' equation, and against finite elements (Q1/DG0) on the same cells with the same steps.
+front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  It is compared with a
+converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells with the same steps.
 
 Errors: for the rain, the largest error of a head at 1, 6 and 12 h over the largest head at that time.  For the front,
 the position of the head -5 m and the infiltrated water, at 6 and 12 h, of material points and of elements.  On one

@@ -13,7 +13,7 @@ rough bar.
 
 Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  The clay is therefore
 seeded again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu
-and Randolph 1998, Int.  J.  Numer.  Anal.  Meth.  Geomech. 22).  Stress is the only memory of this clay.  After each
+and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each
 new seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter, and
 `spread` is its variation there.
 
@@ -65,7 +65,7 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between domains; ahead of the bar, at 0, widths fall to `nose` times those of the others."""
+    """Return the angles between domains; ahead of the bar, at 0, widths fall to `nose` times the other widths."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -106,8 +106,8 @@ class Push:
     """A push, by step: depths over D, resistances over s_u D, whether they are used, and excess pressures over s_u.
 
     frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
-    motion of the points over that of the bar since the clay was seeded, or the excess pressure of wet clay over s_u.
-    lines: then, along both axes, m.
+    displacement of the points over that of the bar, since the clay was seeded.  In wet clay it is the excess pressure
+    over s_u. lines: then, along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -246,7 +246,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar through lines that follow it; return resistance and number of cells, over those with equal cells."""
+    """Push a bar through lines that follow it; return resistance and number of cells, over the values for equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))

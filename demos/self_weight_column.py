@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A soft column settles to less than half its height under its own weight.
 
-A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³. It stands between smooth walls.  Gravity,
+A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  It stands between smooth walls.  Gravity,
 raised to 10 m/s² in equal steps, compresses it to 24.06 m, and its foot to 0.3 of its length, so points cross many
 cells.  The first Piola-Kirchhoff stress at the reference height Y carries the weight above, P = -rho0 g (l0 - Y).  In a
 column of constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lambert's W.  Source: the column

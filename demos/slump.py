@@ -8,14 +8,14 @@ gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On on
 1. Critical strength.  Without friction and drainage, the strength c is lowered by 1 % a step.  A vertical side of
    height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato 2000;
    the best circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a step as at
-   first; 10 or 40 times change the result by 1 %. With 10 and 20 cells over the height it fails at 3.93 and 3.85, which
+   first; 10 or 40 times change the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and 3.85, which
    is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value is 3.78.
 2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, far faster than it drains.
    It slumps, and its crest rides on the flowing soil.  Before the toe, the water carries more than half of the weight.
    At rest the bank reaches twice as far as before; then the excess pressure drains.  The final slope is 23.5 degrees,
-   and 29.3 over the steepest stretch of length H / 3.  The friction angle is 25 degrees, of which a Drucker-Prager cone
-   without dilation mobilises arcsin(eta) = 24.2.  The remaining hundredth of the cohesion adds a little.  Twice the
-   cells or the steps, or half the viscosity, change run-out and height by less than 2 %.
+   and 29.3 over the steepest stretch of length H / 3.  The friction angle is 25 degrees; a Drucker-Prager cone without
+   dilation mobilises only arcsin(eta) = 24.2.  The remaining hundredth of the cohesion adds a little.  Twice the cells
+   or the steps, or half the viscosity, change run-out and height by less than 2 %.
 
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  An observer lowers it
 between two steps.  A step without convergence is cut and repeated with the same strength.  This helps because a viscous

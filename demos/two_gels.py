@@ -7,7 +7,7 @@ the lower one, the contact inclines.  The force along the path, over the vertica
 coefficient.
 
 A second scene is the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the actual
-force of the contact.  Errors of both are those of a few cells over the half-width.
+force of the contact.  The errors of both are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations

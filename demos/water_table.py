@@ -10,8 +10,8 @@ The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  A 
 for two days and falls in two days.  The soil of the levee retains water under suction, so water that infiltrates late
 also drains late.
 
-Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours; the error of
-the final outflow into the ditch.  `balance`: error of the water balance of the slab, over the rain.  On one process.
+Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours, and the error
+of the final outflow into the ditch.  `balance`: error of the water balance of the slab, over the rain.  On one process.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def conductivity():
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures and error of the settlement, exact."""
+    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures; exact settlement."""
     water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
@@ -408,7 +408,7 @@ def layered_rain():
 
 
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
-    """Return a column of two layers; ratio, other: k and alpha of the upper layer over those of the lower."""
+    """Return a column of two layers; ratio, other: k and alpha of the upper layer, relative to the lower layer."""
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2
 
