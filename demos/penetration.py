@@ -246,7 +246,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar through lines that follow it; return resistance and number of cells, over the values for equal cells."""
+    """Push a bar through lines that follow it; return resistance and number of cells, relative to equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))

@@ -8,8 +8,8 @@ gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On on
 1. Critical strength.  Without friction and drainage, the strength c is lowered by 1 % a step.  A vertical side of
    height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato 2000;
    the best circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a step as at
-   first; 10 or 40 times change the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and 3.85, which
-   is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value is 3.78.
+   first; 10 or 40 times change the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and 3.85,
+   which is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value is 3.78.
 2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, far faster than it drains.
    It slumps, and its crest rides on the flowing soil.  Before the toe, the water carries more than half of the weight.
    At rest the bank reaches twice as far as before; then the excess pressure drains.  The final slope is 23.5 degrees,
