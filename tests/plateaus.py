@@ -51,14 +51,6 @@ def strip(cells: int) -> dict[str, float]:
     return {"load": rough_strip(cells, "displacement")}
 
 
-def held(h: float) -> dict[str, float]:
-    """A side pushed along a rough base onto a line of the grid: its load, and once it is held."""
-    from test_given_sides import pushed_along_a_rough_base
-
-    load, _, then = pushed_along_a_rough_base(0.5, 4, 0.5 + h / 2, h)
-    return {"load": load, "held": then}
-
-
 def flowing(cells: int) -> dict[str, float]:
     """A disc that goes into clay whose domains are renewed: its load."""
     from mpm_dolfinx.stepping import renewal
@@ -102,7 +94,6 @@ SCENES = {
     "cycles": (cycled, 0.06, 0.03),
     "soil": (pushed, 5, 9),
     "strip": (strip, 5, 9),
-    "side": (held, 0.1, 0.05),
     "slope": (slope, 6, 12),
     "dry": (wetted, 25, 50),
     "flow": (flowing, 8, 16),

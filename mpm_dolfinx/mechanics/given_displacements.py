@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import replace
 from itertools import combinations
 
 from mpi4py import MPI
@@ -28,10 +27,10 @@ from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
-from mpm_dolfinx.domains.cut_domains import CutDomains, Patches
+from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.mechanics.held_cells import ALIGNED, HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
@@ -152,30 +151,10 @@ class GivenDisplacements(Acting):
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
-            rows.append((self._cells(cut, p), p.x, values))
+            rows.append((p.cell, p.x, values))
         cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
         number, *own = values[:, :6].T
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
-
-    def _cells(self, cut: CutDomains, p: Patches) -> NDArray[np.int64]:
-        """Return the cells (n,) that hold a side: where it is straight along the grid and crosses a line, inner cells.
-
-        Slivers of the body beyond the line have nearly free nodes, which contradictory rows would move far.  Inner
-        cells contain the middle of the domain below, and other parts of the side.
-        """
-        area0, area = p.area(replace(cut.points, corners=cut.points.origin)), p.area(cut.points)
-        sums = area0.sum(axis=0), area.sum(axis=0), np.linalg.norm(area0, axis=1).sum(keepdims=True)
-        whole0, whole, size = np.split(over_all(self._grid.comm, np.concatenate(sums)), [self._grid.dim, -1])
-        axis = int(np.abs(whole).argmax())
-        straight = np.linalg.norm(whole0) >= (1 - ALIGNED) * size[0]
-        if not straight or np.abs(whole[axis]) < (1 - ALIGNED) * np.linalg.norm(whole):
-            return p.cell
-        x = p.x.copy()
-        x[:, axis] = cut.points.x[p.at, axis]
-        under, shape = cut.cells_at(p.at, x), tuple(self._grid.shape)
-        layer, below = (np.unravel_index(cells % self._grid.cells, shape)[axis] for cells in (p.cell, under))
-        holds = over_all(self._grid.comm, np.bincount(layer, minlength=shape[axis])) > 0
-        return np.where(holds[below], under, p.cell)
 
     def _check_meeting(self, t: float) -> None:
         """Refuse prescribed displacements that differ where two sides meet: the stress there would be infinite."""

@@ -236,9 +236,11 @@ class OnGrid(Keyed):
 
         The weight is the storage of the points, so their fluid is kept, or the volume in a cell without storage.
         """
-        contents, points, pieces = self.contents, self.cut.points, self.cut.pieces
-        store = pieces.fraction * (self._quadrature.materials.storage(points) * points.volume0 * points.J)[pieces.point]
-        potential, store = map(self.cut.pieces_to_cells, (at_pieces, store))
+        contents, points = self.contents, self.cut.points
+        pieces = self.cut.pieces
+        of_points = self._quadrature.materials.storage(points) * points.volume0 * points.J
+        store = self.cut.pieces_to_cells(pieces.fraction * of_points[pieces.point])
+        potential = self.cut.pieces_to_cells(at_pieces)
         held, mean = contents.total(store), contents.mean(potential)
         return np.divide(contents.total(store * potential), held, out=mean, where=held > 0)
 
