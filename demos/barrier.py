@@ -2,9 +2,9 @@
 """A bank of clay loses its strength and slides against a rigid barrier: run-out, and force on the barrier.
 
 Half of a bank of undrained clay, 10 m high and as long, stands with a vertical side on a rough floor.  Within ten
-minutes its strength c falls from 0.3 to 0.07 gamma H; it would stand with 0.26.  Inertia is neglected.  A viscous
-stress 2 eta D, a term in UFL, limits the velocity and vanishes at rest.  A wall with an adhesion of c / 2 stops the
-clay.
+minutes its strength c falls from 0.3 to 0.07 gamma H; at 0.26 it would still be stable.  Inertia is neglected.  A
+viscous stress 2 eta D, a term in UFL, limits the velocity and vanishes at rest.  A wall with an adhesion of c / 2 stops
+the clay.
 
 At rest the shear stress on any plane is at most c.  Take a wedge between the wall and a plane through its foot, of
 weight W, angle theta and length l.  It bounds the force F normal to the wall.  The shear V on the wall is at most
@@ -13,7 +13,8 @@ c D / 2, with D the depth of clay there:
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
 The largest lower bound is Coulomb's active force, and the smallest upper bound his passive force, for the present
-surface (Culmann 1866).  Planes that end in the axis are left out.  The measured force at rest lies between both.
+surface (Culmann 1866).  Planes that end on the axis of symmetry are left out.  The measured force at rest lies between
+both.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 class Frame:
     """The bank at a time, s.
 
-    corners (n, 4, 2), m; moved (n,), m: how far points have come; force: normal and along, N/m, and moment about the
+    corners (n, 4, 2), m; moved (n,), m: displacements of the points; force: normal and along, N/m, and moment about the
     foot, N, of the clay on the barrier; bounds of the normal force, N/m; depth of the clay at the barrier, m.
     """
 
@@ -75,12 +76,12 @@ class Frame:
 
     @property
     def run_out(self) -> float:
-        """How far the bank reaches, m."""
+        """Run-out of the bank, m."""
         return float(self.corners[:, :, 0].max())
 
 
 def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
-    """Return the active and the passive force, N/m, of the clay before the barrier, of the strength that it has."""
+    """Return the active and the passive force, N/m, of the clay before the barrier, for its present strength."""
     x, c = s.points.x, s.points.data["cohesion"][0]
     sin, cos, rubs = np.sin(ANGLES), np.cos(ANGLES), ADHESION * depth
     off = x[:, 1, None] * cos - (WALL - x[:, 0, None]) * sin  # (n, planes), m
@@ -94,7 +95,7 @@ def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
 
 @dataclass
 class Slump:
-    """A run: the bank after each step; how many steps, and cuts."""
+    """A run: the bank after each step; numbers of steps and of cuts."""
 
     frames: list[Frame] = field(default_factory=list)
     steps: int = 0
@@ -115,7 +116,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
         out.frames.append(Frame(s.t, corners, moved, force, between, depth))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Give the next step the strength of its end."""
+        """Set the strength at the end of the next step."""
         s.stage(fields={"cohesion": STRONG + min(1.0, (s.t + dt) / DURATION) * (WEAK - STRONG)})
 
     def go(t_end: float, dt: float, *observers) -> None:
@@ -166,7 +167,7 @@ def report(out: dict) -> None:
 
 
 def draw(o: Namespace, free: Slump, held: Slump) -> None:
-    """Draw the bank as it meets the barrier and at rest, with and without it, and the force in time."""
+    """Draw the bank at first contact with the barrier and at rest, with and without it, and the force over time."""
     fig, axes = common.figure(2, 2, (13, 6.6))
     meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
     shown = [

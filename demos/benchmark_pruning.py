@@ -57,7 +57,7 @@ def block(
     grid: mpm.Grid | None = None,
     **options,
 ) -> mpm.Simulation:
-    """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it, unless given."""
+    """Return the block, `n` cells wide; the grid extends to `box`, m, by default two cells beyond the block."""
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
     grid = grid or mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
@@ -78,7 +78,7 @@ def meshed(grid: mpm.Grid, cells: int):
 
 
 def weighted(cells: int) -> mpm.Simulation:
-    """Return the block with the ghost penalty on all faces: every cell passes for nearly empty."""
+    """Return the block with the ghost penalty on all faces: every cell is treated as nearly empty."""
     ratio, ghost_penalty.RATIO = ghost_penalty.RATIO, 1e6
     try:
         simulation = block(cells)
@@ -97,7 +97,7 @@ def restless(cells: int, **options) -> mpm.Simulation:
 
 
 def of_many_sizes(cells: int, moves: bool) -> mpm.Simulation:
-    """Return the block with the grid reset in each step, in cells of two sizes; moves: whether its lines swing."""
+    """Return the block with the grid reset in each step, in cells of two sizes; moves: whether its lines oscillate."""
 
     def lines(t: float) -> list[np.ndarray]:
         even = [np.linspace(0, end, n + 1) for end, n in ((1, cells), (1 + 2 / cells, cells + 2))]
@@ -109,7 +109,7 @@ def of_many_sizes(cells: int, moves: bool) -> mpm.Simulation:
 
 
 def refactorised(cells: int) -> mpm.Simulation:
-    """Return the draining block of a linear law, taken for one that is not."""
+    """Return the draining block of a linear law that is treated as nonlinear."""
     simulation = linear(cells)
     simulation.scene.momentum.linear = False
     return simulation
@@ -138,14 +138,14 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """A skeleton whose pressure jumps are looked after at four times the flow."""
+    """A skeleton whose pressure jumps are evaluated up to four times the flow."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block with 8 tau h² of flow in a substep; below 4 jumps are looked after, below 1 damped."""
+    """Return the draining block with 8 tau h² of flow in a substep; jumps are evaluated below 4, and damped below 1."""
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
@@ -164,7 +164,7 @@ def plastic(cells: int, law: type[mpm.Skeleton], **constants) -> mpm.Simulation:
 
 
 def clayey(cells: int) -> mpm.Simulation:
-    """Return the block of overconsolidated clay of the same bulk modulus, pressed as it was at the start and more."""
+    """Return the block of overconsolidated clay of the same bulk modulus, under its initial stress and a load."""
     p = 1e5  # Pa
     moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk}
     clay = mpm.ModifiedCamClay(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), **moduli)

@@ -2,7 +2,7 @@
 """Thresholds between linear solvers: both solvers are timed on each side of the thresholds of the plan.
 
 Each row is a scene of a given number of displacement unknowns.  The threshold is moved so that either solver is used.
-Times are processor times of two steps, the shortest of --repeat turns.  The table is in
+Times are processor times of two steps, the shortest of --repeat runs.  The table is in
 `mpm_dolfinx/solve/solver_choice.py`.
 """
 
@@ -22,7 +22,7 @@ STEPS = 2
 
 
 def block(dim: int, n: int, soil: mpm.Skeleton, fluid: bool) -> mpm.Simulation:
-    """Return a block of n cells along each axis, its foot held, that a growing load presses."""
+    """Return a block of n cells along each axis, fixed at its base, under a growing load."""
     grid = mpm.Grid([0.0] * dim, [1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + n // 4])
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-1e4 * t])
     walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
@@ -48,7 +48,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
-    """Return the time (s), the unknowns and the plan of steps with another threshold."""
+    """Return the time (s), the number of unknowns and the solver plan of steps with another threshold."""
     usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
     try:
         s = make(n)

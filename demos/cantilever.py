@@ -52,7 +52,7 @@ class Outcome:
 
 
 def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, float], Outcome]:
-    """Bend the beam, that many cells high, to alpha = last in increments of 10 / steps.
+    """Bend the beam, `cells` cells high, to alpha = last in increments of 10 / steps.
 
     Returns the errors that the module's docstring defines, and the axes.
     """
@@ -108,7 +108,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the deformed axes with the rod's, and the tips with the elastica's."""
+    """Draw the deformed axes of beam and rod, and the tips of beam and elastica."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.8))
     for i, (alpha, axis) in enumerate(out.axis.items()):
         left.plot(*rod(alpha).T, color="black", lw=1, label=None if i else "shear-flexible rod")

@@ -41,7 +41,7 @@ def rod(alpha: float) -> tuple[float, float]:
 
 
 def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]:
-    """Return the beam, that many cells high, and the middle of its end; time 1 is the load alpha."""
+    """Return the beam, `cells` cells high, and the middle of its end; at time 1 the load is alpha."""
     h = SIDE / cells
     reach = np.abs(ALONG) * rod(alpha)[1] * 1.05
     span = np.array([LENGTH * 1.05, SIDE, SIDE]) + reach + 3 * h
@@ -133,7 +133,7 @@ def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
 
 
 def report(o: Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
-    """Print the tips and the rod's."""
+    """Print the tips of the beam and of the rod."""
     u, v = rod(o.alpha)
     rows = {steps: (tip @ ALONG, tip @ ACROSS, -tip[0]) for steps, tip in zip(o.steps, tips, strict=True)}
     head = ["load steps", "along (m)", "across (m)", "shortening (m)"]

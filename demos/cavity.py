@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Expansion of a cylindrical cavity in clay and in sand, on a grid of squares.
 
-A quarter of a ring of soil has b = 5 a0.  The prescribed displacement of its wall is a fifth of a cell in a step, and a
-tenth if undrained, because laws with history are integrated to first order.  With eight cells and steps of a fifth of a
-cell, the radial solution itself has pore pressures 1.5 % too low at a = 1.1 a0 in yielding normally consolidated clay.
+A quarter of a ring of soil has b = 5 a0.  The wall moves by a fifth of a cell in each step, and by a tenth in undrained
+soil, because laws with history are integrated to first order.  With eight cells and steps of a fifth of a cell, the
+radial solution itself has pore pressures 1.5 % too low at a = 1.1 a0 in yielding normally consolidated clay.
 
 1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water flows.  The outside
    keeps its initial pressure.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
@@ -49,9 +49,10 @@ def well() -> mpm.ModifiedCamClay:
 
 @dataclass(frozen=True)
 class Drained:
-    """A drained cavity in soil without end.
+    """A drained cavity in infinite soil.
 
-    soil, state: with the state that it begins with; known: radius -> pressure over p_0; reach: of the radial solution.
+    soil, state: the soil and its initial state; known: radius -> pressure over p_0; reach: radius of the radial
+    solution.
     """
 
     soil: mpm.Skeleton
@@ -76,9 +77,9 @@ def ray(X: np.ndarray) -> np.ndarray:
 
 
 def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
-    """Return a quarter of the ring, with a number of cells over the hole's radius, which is 1 + t.
+    """Return a quarter of the ring, with a number of cells over the radius of the hole; the radius is 1 + t.
 
-    outside: displacement of its outside, m, at a time; widest: the largest radius of the hole.
+    outside: displacement of the outer boundary, m, as a function of time; widest: the largest radius of the hole.
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
@@ -98,7 +99,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the hole to a radius, m, so much of a cell in a step; return the total pressure in it over p_0."""
+    """Widen the hole to a radius, m, by a fraction of a cell per step; return the total pressure in it over p_0."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)
@@ -110,7 +111,7 @@ def pressure(s: mpm.Simulation, radius: float) -> float:
 
 
 def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
-    """Return radius -> pressures over p_0: that in the hole, and that of the radial solution."""
+    """Return radius -> pressures over p_0: in the hole, and of the radial solution."""
     case = DRAINED[name]
     widest = max(case.known)
     reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
@@ -129,8 +130,8 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 class Undrained:
     """Results of an undrained expansion and of the consolidation after it.
 
-    total, water: radius -> pressure in the hole less p_0, and pore pressure at its wall, over p_0, with the exact ones;
-    profiles: (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
+    total, water: radius -> pressure in the hole minus p_0, and pore pressure at its wall, over p_0, and the exact
+    values; profiles: (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
     """
 
     total: dict[float, tuple[float, float]]
@@ -140,7 +141,7 @@ class Undrained:
 
 
 def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
-    """Return the pore pressure over p_0 at the wall: a line in ln r, as soil that flows has it, through two cells."""
+    """Return the pore pressure over p_0 at the wall, linear in ln r through two cells, as in yielding soil."""
     r = np.linalg.norm(s.points.x, axis=1)
     near = r < radius + 2 * h
     return float(np.polyfit(np.log(r[near] / radius), s.points.pressure[near] / P0, 1)[-1])

@@ -2,14 +2,15 @@
 """Columns of dry sand collapse: run-out and height against published experiments, and energies.
 
 Columns of width L and height a L, a = 0.5, 1, 4 and 8, stand against a smooth wall on a rough floor.  Their right side
-is let go at once.  Lube et al. (2005) found for sand, sugar and rice in a channel, with angles of repose near 31
+is released at once.  Lube et al. (2005) found for sand, sugar and rice in a channel, with angles of repose near 31
 degrees, that the front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
 
-The sand follows Mohr and Coulomb's law without dilation.  In simple shear it bears sin phi of the normal stress
-(Davis 1968), so sin phi = tan 31 degrees.  Grains of d = L/100 add a viscosity, as friction in fast flow grows by
-0.93 I with the inertial number I (Jop, Forterre and Pouliquen 2006): 0.93 d sqrt(p rho_s), at the pressure p in the
-middle of a heap of half the height.  A constant viscosity is as good as a local one (Ionescu et al. 2015).  Without it
-shear localises in single cells, and energy is lost there.  The front is where the sand is a grain deep.
+The sand follows Mohr and Coulomb's law without dilation.  In simple shear it bears sin phi of the normal stress (Davis
+1968), so sin phi = tan 31 degrees.  Grains of d = L/100 add a viscosity, as friction in fast flow grows by 0.93 I with
+the inertial number I (Jop, Forterre and Pouliquen 2006): 0.93 d sqrt(p rho_s), at the pressure p in the middle of a
+heap of half the height.  A constant viscosity is as good as a local one (Ionescu et al. 2015).  Without it shear
+localises in single cells, and energy is lost there.  The front is the point at which the depth of the sand is one
+grain.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011),
 J. Fluid Mech. 686, 378.
@@ -35,7 +36,7 @@ STEPS = 50  # in sqrt(H/g)
 
 
 class Heap(NamedTuple):
-    """Run-out and height, m, shares of the work that are lost and still kinetic, profiles on the way, and the run.
+    """Run-out and height, m, lost and kinetic energy over the work, profiles in motion, and the run.
 
     before, after: corners of the domains, m; profiles: middles of strips, m, and depths of sand in them, m.
     """
@@ -51,7 +52,7 @@ class Heap(NamedTuple):
 
 
 def published(aspect: float) -> float:
-    """Return the run-out over the width by Lube et al., between their laws in proportion."""
+    """Return the run-out over the width by Lube et al., interpolated linearly between their laws."""
     return float(np.interp(aspect, (1.8, 2.8), (0, 1)) * (1.9 * aspect ** (2 / 3) - 1.2 * aspect) + 1.2 * aspect)
 
 
@@ -89,7 +90,7 @@ def depths(s: mpm.Simulation, h: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN) -> Heap:
-    """Let a column go; return what is left of it.  steps: in the time sqrt(H/g); grain: see `column`."""
+    """Release a column and return its `Heap`.  steps: in the time sqrt(H/g); grain: see `column`."""
     s = column(aspect, cells, grain)
     fall = np.sqrt(aspect / GRAVITY)
     before, profiles = s.points.corners.copy(), []
@@ -142,7 +143,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heaps: dict[float, Heap]) -> None:
-    """Draw a column on its way, run-outs beside the published law, and energies."""
+    """Draw a column in motion, run-outs with the published law, and energies."""
     fig, ((way, runs, energy),) = common.figure(1, 3, (15, 4))
     a = min(heaps, key=lambda a: abs(a - 1))
     one = heaps[a]

@@ -28,7 +28,7 @@ COLOURS = "#0072B2 #E69F00 #009E73 #D55E00 #CC79A7 #56B4E9 #882255 #7F7F7F #9999
 class Parser(argparse.ArgumentParser):
     """The options of a demo: its own, --json and, if it writes files, --out.
 
-    processes: whether it runs on several.
+    processes: whether the demo runs on several processes.
     """
 
     class Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
 
     def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
-        """Return the options, and in `takes` how long they take (s or min) if the gallery tells."""
+        """Return the options, with the run time (s or min) of the gallery in `takes`, if it is there."""
         args = sys.argv[1:] if args is None else list(args)
         o = super().parse_args(args, namespace)
         if not self.processes:
@@ -64,7 +64,7 @@ class Parser(argparse.ArgumentParser):
 
 @contextmanager
 def results(o: argparse.Namespace) -> Iterator[dict]:
-    """Yield the results of a run for the demo to fill; print before how long it takes, and them after it (--json).
+    """Yield the results, which the demo fills; print the run time before, and the results after the run (--json).
 
     A run that gives up (`mpm.GaveUp`) ends with a line.  Then `converged` is False, and earlier results are kept.
     """
@@ -88,7 +88,7 @@ def results(o: argparse.Namespace) -> Iterator[dict]:
 
 
 def first() -> bool:
-    """Is this the process that prints and draws?"""
+    """Return whether this process prints and draws."""
     return MPI.COMM_WORLD.rank == 0
 
 
@@ -100,7 +100,7 @@ def whole(s: mpm.Simulation, *names: str) -> list[np.ndarray]:
 
 
 def table(rows: Iterable[Iterable[str]]) -> None:
-    """Print rows of text, the head first, in columns as wide as their entries: the first to the left."""
+    """Print rows of text, the head first, in columns as wide as their entries; the first column is left-aligned."""
     rows = [list(row) for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for name, *entries in rows:
@@ -146,7 +146,7 @@ def save(fig, path: Path, dpi: int = 130) -> None:
 
 
 def weight(unit_weight: float) -> Callable:
-    """Return the term of a weight, N/m³ of the ground as it was, downwards."""
+    """Return the term of a weight, N/m³ of the undeformed ground, downwards."""
 
     def weight(points, v):
         return unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx

@@ -2,8 +2,9 @@
 """Iterations of the coupling between displacement and pore pressure, from drained to undrained.
 
 The linear systems of Newton's first step are solved to 1e-8 (true residual).  Scenes are a cantilever (the poroelastic
-beam, at rest and bent) and a footing on a column.  Only the product of conductivity and step matters.  It goes from
-1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The water goes from soft (1e4 Pa) to incompressible.
+beam, at rest and bent) and a footing on a column.  Only the product of conductivity and step matters.  This product
+ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the water ranges from 1e4 Pa to
+infinity.
 
 Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with
 the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C + beta V.  The
@@ -11,7 +12,8 @@ third is the plain fixed-stress (Richardson) iteration with beta = 0.5, 0.75 and
 which diverges.  An iteration is one solve of the storage and one of the momentum.
 
 Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
-bounds them, and with them the number of iterations.  The second picture shows the pressure with and without it.
+bounds these modes, and with them the number of iterations.  The second picture shows the pressure with and without
+damping.
 """
 
 from __future__ import annotations
@@ -119,7 +121,7 @@ class System:
 def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
     """Return the scene in its present state with water of another bulk modulus, Pa.
 
-    Its pressures become no larger than a tenth of that: the density would be none that water has.
+    The pressures are limited to a tenth of this modulus; otherwise the density of the water would be unphysical.
     """
     soils, walls = s.scene.materials.materials, s.state.stage.conditions["walls"]
     other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=s.conditions)
@@ -179,12 +181,12 @@ def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) ->
 
 
 def worst(counts: list[Count]) -> float:
-    """Return the most iterations of some counts; infinite if one diverges or takes more than MOST."""
+    """Return the largest number of iterations of some counts; infinite if one diverges or takes more than MOST."""
     return max(np.inf if c.iterations is None else c.iterations for c in counts)
 
 
 def cells(s: mpm.Simulation) -> NDArray[np.float64]:
-    """Return the pressure of the cells (nx, ny), Pa; nan where nothing is and near the corners of the clamp."""
+    """Return the pressure of the cells (nx, ny), Pa; nan in empty cells and near the corners of the clamp."""
     p = np.full(s.grid.shape.prod(), np.nan)
     body = s.bodies[0]
     corners = [[0, body.lower[:, 1].min()], [0, (body.lower + body.spacing)[:, 1].max()]]

@@ -7,8 +7,8 @@ falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Flui
 nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the sphere; with --axisymmetric, a quarter
 of a disc.
 
-Errors of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its largest
-value, and `curve`, the largest over T from 0.02 on, over p0.
+Errors of the pressure at the centre at reduced times T = c_v t / R²: `peak` is the relative error of its largest value,
+`curve` the largest error from T = 0.02 on, over p0.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def disc(x: np.ndarray) -> np.ndarray:
 
 
 def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
-    """Return the octant, or the quarter disc, with that many cells to the radius."""
+    """Return the octant, or the quarter disc, with `cells` cells over the radius."""
     h = RADIUS / cells
     if axisymmetric:
         grid, sides = mpm.Grid([0] * 2, [RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True), ("right", "top")

@@ -80,16 +80,16 @@ def cycle(
     seed
         Returns the body, called with grid, lower and upper corner, and points per cell and direction.
     fluid
-        Of a beam that nothing drains.
+        Pore fluid; the beam is undrained.
     springs
-        Stiffness, Pa/m, of springs along the wall that hold the beam up there in place of the clamp: most in its
-        middle, none at its edges, so that no stress is singular.
+        Stiffness, Pa/m, of springs along the wall that support the beam in place of the clamp.  It is largest in the
+        middle and zero at the edges, so that no stress is singular.
 
     Returns
     -------
-    left: rms of the stress after each cycle over that at the first peak; away: the same but at the wall; times, tips
-    (m): of each step; lost: work of the load in each cycle over that up to the first peak; volume: change of the beam's
-    volume less that of its water; balance: of the fluid.
+    left: rms of the stress after each cycle over that at the first peak; away: the same without points near the wall;
+    times, tips (m): time and tip deflection of each step; lost: work of the load in each cycle over the work up to the
+    first peak; volume: volume change of the beam minus that of its water; balance: error of the fluid balance.
     """
     o = options(h, load, quadrature)
     cells = np.rint(beam.BOX / h).astype(int)
@@ -140,7 +140,7 @@ def cycle(
 
 
 def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = None) -> float:
-    """Return by how much a turn by 360 degrees changes the total stress in the middle of the stretched block, rms.
+    """Return the rms change of the total stress in the middle of the stretched block after a rotation by 360 degrees.
 
     With a fluid the block is undrained.
     """
@@ -175,7 +175,7 @@ def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = N
 
 
 def orders(h: list[float], left: list[float]) -> list[float]:
-    """Return the orders in the cell size from each to the next."""
+    """Return the orders of convergence between successive cell sizes."""
     return [float(np.log(a / b) / np.log(c / d)) for a, b, c, d in zip(left, left[1:], h, h[1:], strict=False)]
 
 

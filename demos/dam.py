@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A dam: seepage with a free surface, as the reservoir falls, in soil whose pores drain under suction.
+"""A dam: seepage with a free surface during drawdown of the reservoir, in unsaturated soil.
 
-A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the pore water is level with the reservoir, 5
-m. Then the other slope is opened, and the flow becomes steady.  Then the reservoir falls by 2 m in five days, and the
-free surface, p = 0, follows as the soil drains.  Above it water flows under suction (`mpm.VanGenuchten`).  The
-reservoir loads the wet slope.  Above the water, both slopes are seepage faces.
+A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
+reservoir, 5 m.  Then the other slope becomes permeable, and the flow becomes steady.  After that the reservoir falls by
+2 m in five days, and the free surface, p = 0, follows as the soil drains.  Above it water flows under suction
+(`mpm.VanGenuchten`).  The reservoir loads the wet slope.  Above the water, both slopes are seepage faces.
 
 Checks:
 
-* `flow`: outflow of a rectangular dam over the exact one.  The dam is 9.6 m wide, with 10 m and 2 m of water at its
-  sides, and water at rest above.  The exact flow is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with Kirchhoff's
-  potential, the integral of k_r over the head, in place of the head;
-* `steady`: inflow of the dam over its outflow, before the reservoir falls;
-* `drained`: outflow of a column over that of finite elements on cells a quarter as large.  Its free surface falls from
-  8 m towards 2 m.
+* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
+  water at its sides, and water at rest above.  The exact flow is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with
+  Kirchhoff's potential, the integral of k_r over the head, in place of the head;
+* `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
+* `drained`: ratio of the outflow of a column to that of finite elements on cells a quarter as large.  Its free surface
+  falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Dam:
         self.balance = max(self.balance, result.balance)
 
     def see(self, simulation: mpm.Simulation) -> None:
-        """Keep the present flows, corners and pressures."""
+        """Record the present flows, corner positions and pressures."""
         self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
@@ -109,7 +109,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
 
 def rectangular(cells: int) -> float:
-    """Return the flow through a rectangular dam over the exact one."""
+    """Return the ratio of the flow through a rectangular dam to the exact flow."""
     levels, width, top = (10.0, 2.0), 9.6, 12.0
     h = top / cells
     grid = mpm.Grid([0, 0], [width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])
@@ -135,7 +135,7 @@ def rectangular(cells: int) -> float:
 
 
 def driving(level: float, top: float) -> float:
-    """Return the integral over the height of that of k_r over the head, m^2, with water at rest about a level, m."""
+    """Return the integral of Kirchhoff's potential over the height, m^2, for water at rest about a level, m."""
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
     k_r = filled**law.l * (1 - (suction * WEIGHT / law.entry) ** (law.n - 1) * filled) ** 2
@@ -145,7 +145,7 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow of a column of 10 m, m, and that of finite elements on four times as many cells.
+    """Return the outflows, m, of a column of 10 m and of finite elements on four times as many cells.
 
     The free surface is at 8 m at first; the head at the base is 2 m.
     """

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Liakopoulos's column: wet sand drains at its foot under gravity, contracts by suction, and settles.
 
-A column of 1 m, at rest under the weight of its water, p = 0 everywhere, is opened at its foot.  Its retention curve
-is a user's own.  The skeleton carries chi p with chi the saturation.  The reference is a converged solution with 400
+A column of 1 m, at rest under the weight of its water, p = 0 everywhere, is opened at its foot.  Its retention curve is
+user-defined.  The effective stress uses chi p, with chi the saturation.  The reference is a converged solution with 400
 finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, over the largest pressure at that
-time.  Others are errors of the settlement and of the outflow at the foot.  On one process.
+Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, over the largest pressure at that time.
+Further errors refer to the settlement and to the outflow at the foot.  On one process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CONVERGED = {
     30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
     120: ((-906.99, -2267.84, -4542.4, -6847.5, -8264.9), 1.55827e-3, 3.33066e-7),
 }
-"""By minutes: pressures at the heights, Pa, settlement, m, and flow out of the foot, m/s."""
+"""Converged values by time, min: pressures at the heights, Pa, settlement, m, and outflow at the foot, m/s."""
 
 
 class Sand:
@@ -43,7 +43,7 @@ class Sand:
 
 
 def column(cells: int) -> mpm.Simulation:
-    """Return the column, that many cells high."""
+    """Return the column, `cells` cells high."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [h, 1 + 2 * h], [1, cells + 2])
     moduli = {"bulk": E / 3 / (1 - 2 * NU), "shear": E / 2 / (1 + NU)}

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """An embankment under water is built in lifts on soft clay, which consolidates.
 
-Half of the section (x = 0 is a plane of symmetry): 6 m of clay, and four lifts of 1 m with slopes of 1:2, one every
-90 days, followed by ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh).  It is placed on the
+Half of the section (x = 0 is a plane of symmetry): 6 m of clay, and four lifts of 1 m with slopes of 1:2, one every 90
+days, followed by ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh).  It is placed on the
 present ground and filled up to its design level, which makes up for the settlement.  Pressures are in excess of the sea
-above, and weights are buoyant.  The weight of the lifts is a term in UFL; the clay is in equilibrium with its own from
-the start.  A lift closes the drainage of the ground below, and its slope and crest are drained.  On one process.
+above, and weights are buoyant.  The weight of the lifts is a term in UFL; the clay is in equilibrium with its own
+weight from the start.  A lift closes the drainage of the ground below, and its slope and crest are drained.  On one
+process.
 
 Check: at the end the lowest points of the clay carry the weight of the lifts with their additional fill.  `carried` is
-the integral of the effective stress there over that weight, 1 in equilibrium.
+the ratio of the integral of the effective stress there to this weight; it is 1 in equilibrium.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ BUOYANT = 0.6 * (2650 - 1000) * 9.81  # N/m^3
 
 @dataclass(frozen=True)
 class Weighed(mpm.Hencky):
-    """Hencky's law for soil with a buoyant weight, N/m^3, that its points carry for the term `weight`."""
+    """Hencky's law for soil with a buoyant weight, N/m^3, a field of its points for the term `weight`."""
 
     unit_weight: mpm.Field = 0.0
 
@@ -82,7 +83,7 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the bund on cells of size h, m, with a number of steps between two lifts, and 6 times as many after."""
+    """Build the bund on cells of size h, m, with `steps` steps between two lifts, and 6 times as many at the end."""
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

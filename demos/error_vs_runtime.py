@@ -6,10 +6,10 @@ material points vary.  The finite elements are body-fitted: Q1/DG0 on the same g
 shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged in space
 and in time.
 
-* beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, and from 0.1 s on.  The
-  reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
-* drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
-* terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
+* beam: the poroelastic beam; largest error of the tip deflection over all output times `beam.TIMES`, and over the times
+  from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
+* drained: the same beam without water, load in ten steps; error of the tip against 67 x 20 Taylor-Hood elements
+* terzaghi: settlement at T_v = 0.5, against the exact one;  mandel: settlement of the plate at T = 0.1, exact
 * column: height of the soft column under its own weight, exact
 """
 
@@ -45,12 +45,12 @@ STYLES = {  # of the lines: colour and marker of a method, in all cases
     TRUTH: ("black", "s"),
 }
 Run = Callable[[], tuple[float | tuple[float, float], mpm.Result, float]]
-"""A run: error (of the beam also the late one), result, compile seconds."""
+"""A run: error (for the beam also that from 0.1 s on), result, compile seconds."""
 
 
 @dataclass
 class Row:
-    """A measured run; late: its error from 0.1 s on, of the beam."""
+    """A measured run; late: error of the beam from 0.1 s on."""
 
     case: str
     method: str
@@ -217,7 +217,7 @@ CASES = {
 
 
 def measure(case: str, quick: bool, repeat: int) -> list[Row]:
-    """Run one case; a run that gives up has no error."""
+    """Run one case; the error of a run that gives up is nan."""
     rows = []
     for method, setting, run in CASES[case](quick):
         try:
@@ -238,12 +238,12 @@ def measure(case: str, quick: bool, repeat: int) -> list[Row]:
 
 
 def time_at(rows: list[Row], error: float) -> float:
-    """Return the least time in which runs reach an error; nan where none does."""
+    """Return the shortest time in which runs reach an error; nan if none does."""
     return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
 
 
 def compare(rows: list[Row]) -> list[dict]:
-    """Return, for every run with default settings, its time over the peer's on the same grid and at no more error."""
+    """Return, for each default run, the ratio of its time to that of finite elements on its grid and at its error."""
     out = []
     for r in (r for r in rows if r.method == DEFAULT):
         peers = [q for q in rows if q.case == r.case and q.method == PEER]

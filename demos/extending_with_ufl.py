@@ -7,10 +7,10 @@ of fluid.  Others add a law with its own state, plastic flow, an implicit stress
 parameters of a function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the package
 list them.
 
-Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for
-energy and fibres, with stretched layers in their single step; 3e-3 for both conductivities,
-6e-4 for the foundation and 5e-4 for the source.  They fall with the cell size.  The damage has 1e-5, because its top
-yields a little.  Plastic flow, the implicit stress and the return mapping have 1e-11.
+Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for energy
+and fibres, with stretched layers in their single step; 3e-3 for both conductivities, 6e-4 for the foundation and 5e-4
+for the source.  These errors fall with the cell size.  The error of the damage is 1e-5, because its prescribed top
+gives way a little.  Plastic flow, the implicit stress and the return mapping have errors of 1e-11.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2): twice as stiff in each quarter downwards."""
+    """Return a modulus, Pa, at reference positions (n, 2): it doubles from each quarter to the next one below."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 
@@ -128,7 +128,7 @@ class Fibrous(mpm.NeoHookean):
 
 
 def direction(X: np.ndarray) -> np.ndarray:
-    """Return the direction of the fibres at reference positions (n, 2): upright in every other layer."""
+    """Return the direction of the fibres at reference positions (n, 2): vertical in every other layer."""
     return np.where(np.floor(4 * X[:, [1]]) % 2, (0.0, 1.0), (1.0, 0.0))
 
 
@@ -152,7 +152,7 @@ def of_strain(conductivity, J):
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Press water upwards through a column of two layers; the load compresses the lower one more."""
+    """Let water flow upwards through a column of two layers; the load compresses the lower layer more."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)
@@ -185,7 +185,7 @@ STIFFNESS = 4e6  # Pa/m per m of displacement: force per volume
 
 
 def foundation(points, u):
-    """Return the energy stored in springs between all of the body and its place at the start."""
+    """Return the energy of springs between the points of the body and their initial positions."""
     U = points.displacement + points.value(u)
     return STIFFNESS / 2 * ufl.inner(U, U) / ufl.det(points.F) * points.dx
 
@@ -206,7 +206,7 @@ RATE = 1e-7  # 1/s
 
 
 def source(points, q):
-    """Return an even source: volume of water per volume and time."""
+    """Return a uniform source: volume of water per volume and time."""
     return RATE * q * points.dx
 
 
@@ -249,7 +249,7 @@ def path(s: mpm.Simulation, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damage(cells: int) -> Example:
-    """Press the column together, let it go and press it further."""
+    """Compress, unload and reload the column to a larger compression."""
 
     def top(t, X):
         return 0, 0.3 * np.interp(t, [0, 0.4, 0.7, 1], [0, -0.6, -0.1, -1])
@@ -340,7 +340,7 @@ def local_unknown(cells: int) -> Example:
 
 
 def numpy_law(cells: int) -> Example:
-    """Crush the foam, let it go and crush it further."""
+    """Crush, unload and reload the foam to a larger compression."""
     foam = Crushable(bulk=1e6, shear=2e5)
 
     def load(t: float) -> float:

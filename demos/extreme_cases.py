@@ -66,7 +66,7 @@ class Row:
 
 
 class Hung(Exception):
-    """A case takes longer than the limit."""
+    """A case that takes longer than the limit."""
 
 
 def hang(*_) -> None:
@@ -74,7 +74,7 @@ def hang(*_) -> None:
 
 
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
-    """Run a case and fill in its row; with `rtol` in steps chosen by their error, none longer than the scene's."""
+    """Run a case and fill in its row; with `rtol`, adaptive steps are at most as long as the scene's."""
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()
@@ -105,7 +105,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
 
 
 def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
-    """Compare a run that came to its end with its reference."""
+    """Compare a complete run with its reference."""
     s = scene.simulation
     row.condition = condition(s.scene.last[1].momentum.K)
     try:
@@ -137,7 +137,7 @@ def worst(rows: list[Row], name: str) -> float:
 
 
 def table(head: list[str], rows: list[list]) -> str:
-    """Return a Markdown table; numbers in short, blank if they are not."""
+    """Return a Markdown table, with numbers in short form and blanks for missing ones."""
 
     def cell(v) -> str:
         if isinstance(v, float):

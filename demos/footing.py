@@ -5,10 +5,10 @@ Half of the footing, rough and rigid, is a prescribed displacement on a part of 
 2.5 B thick on rough rock.  It follows Drucker and Prager's law with cohesion c, is weightless, and drains at its free
 top.  v is the rate of the push, V = v B / c_v its ratio to that of consolidation, B the footing's width.
 
-The box ends 8 B from the middle at a smooth, impervious wall.  A wall at 16 B changes no load by 1 %, at any depth and
-rate; the demo shows it, on fewer cells.  With a wall at 4 B drained loads are up to 8 % too large while the soil below
-yields, before the limit is reached.  The thickness of the layer matters.  In plane strain the settlement of a thicker
-layer grows without bound, as its logarithm (5 B: loads down by 11 % at 0.1 B, 3 % at 0.5 B).
+The box ends 8 B from the middle at a smooth, impervious wall.  With a wall at 16 B, loads change by less than 1 % at
+any depth and rate; the demo shows this on fewer cells.  With a wall at 4 B drained loads are up to 8 % too large while
+the soil below yields, before the limit is reached.  The thickness of the layer matters.  In plane strain the settlement
+of a thicker layer grows without bound, as its logarithm (5 B: loads down by 11 % at 0.1 B, 3 % at 0.5 B).
 
 Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c,
 N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  The limit loads use very stiff soil, which flows before
@@ -19,21 +19,22 @@ For the deep push the soil does not dilate.  Its undrained strength is s_u = xi 
 surface lies between that of Davis's (1968) reduced friction and c N_c.
 
 The undrained limit converges from below, with order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The last fixed node
-carries half a cell beyond it, so an odd number of cells has the true width.  With 4, 8, 16 cells the last node lies at
-the edge, and the load is larger by that half cell on both sides.
+carries half a cell beyond it, so an odd number of cells represents the true width.  With 4, 8, 16 cells the last node
+lies at the edge, and the load is larger by that half cell on both sides.
 
 In associated flow each point of a cell must dilate with its own shear, but the cell has one mean dilatation.  The
 load would rise without limit (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  In fully yielding
 cells, laws therefore use half of the deviation of the gradient from its mean: -1.0, +0.2, +0.8 % with 5, 9, 17 cells.
 
-A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
+The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
-With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside of it, cells grow by a tenth from one to the
-next, up to eight times.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B with fine cells only.
+With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside it, each cell is a tenth longer than the one
+before, up to eight times the length of the smallest.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x
+2.5 B with fine cells only.
 
-With non-associated flow the answer is not unique.  Shear bands one cell wide jump from place to place, more
-so with finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a resistance to the
-shear rate, small compared with the cohesion, which makes the answer unique (Needleman 1988).
+With non-associated flow the solution is not unique.  Shear bands one cell wide jump from place to place, more so with
+finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a resistance to the shear
+rate, small compared with the cohesion, which makes the solution unique (Needleman 1988).
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ SURFACE = {  # loads over B c; Davis: tan phi* = sin phi of the same strength in
 
 
 def embedded(depth):
-    """Return the undrained limit of a base at a depth over B, over B c."""
+    """Return the undrained limit load over B c of a base at a depth, over B."""
     return SURFACE["undrained"] * (1 + 0.27 * np.sqrt(depth))
 
 
@@ -99,8 +100,8 @@ def embedded(depth):
 class Frame:
     """A moment of a push.
 
-    t: time over its duration; settlement over B; corners of the domains, m; pressure of the points, Pa;
-    top (m, 2): the soil's surface from the middle outward, m.
+    t: time over the duration of the push; settlement over B; corners of the domains, m; pressure of the points, Pa; top
+    (m, 2): the soil's surface from the middle outward, m.
     """
 
     t: float
@@ -112,9 +113,9 @@ class Frame:
 
 @dataclass
 class Push:
-    """A push: settlement over B and load over B c, an entry a step; some frames; the step of its end; its runs.
+    """A push: settlement over B and load over B c in each step; some frames; the last step of the push; its runs.
 
-    Heights count from the soil's first surface.
+    Heights are measured from the initial surface of the soil.
     """
 
     settlement: list[float] = field(default_factory=lambda: [0.0])
@@ -210,7 +211,7 @@ def push(
 def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
     """Push the footing into very stiff soil; its loads are relative to theory.
 
-    box, graded: see `push`; by default that of `LIMITS_OF`, of equal cells.
+    box, graded: see `push`; by default the box of `LIMITS_OF` with equal cells.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own
@@ -275,7 +276,7 @@ def main(argv: list[str] | None = None) -> dict:
 def of_many_sizes(cells: int, folder: Path) -> dict:
     """Print and draw the undrained limit load in a large box of graded cells and in a small one of equal cells.
 
-    Returns it with the points and the seconds of processor time.
+    Returns this load with the points and the processor time, s.
     """
     out, runs = {}, {}
     for how, box in FAR.items():
@@ -311,8 +312,10 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity, over c and the seconds of a push: it resists by this share of c more at a shear
-    strain of 1 in that time."""
+    """Return the soil with a viscosity, relative to c times the duration of a push, s.
+
+    It equals the additional resistance over c at a shear strain of 1 in this duration.
+    """
     if viscosity == 0:
         return SOIL
     own = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)} | {"residual": COHESION, "slip": WIDTH}  # none softens
@@ -340,7 +343,7 @@ def effort(cells: int, depth: float, steps: int, width: float, method: str, visc
 
 
 def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
-    """Print by how much the limit loads of stiff soil differ from the theory and return it."""
+    """Print and return the differences of the limit loads of stiff soil from the theory."""
     out = {}
     for (how, cells), run in stiff.items():
         out[f"{how}_{cells}"] = run.load[-1] - 1
@@ -351,7 +354,7 @@ def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
 
 
 def twice_the_box(cells: int, depth: float) -> dict[str, float]:
-    """Print the largest change of load in a box twice as wide, over the load in `BOX` at that depth; return it."""
+    """Print and return the largest change of load in a box twice as wide, over the load in `BOX` at that depth."""
     out = {}
     for name, rate in RATES.items():
         near, far = (push(SOIL, cells, depth, rate, box=(wide * BOX[0], BOX[1])) for wide in (1, 2))
@@ -392,7 +395,7 @@ def report(runs: dict[str, Push]) -> dict:
 def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
     """Draw the pressure, in c, of two frames as left and right half of the soil, and the footing.
 
-    Domains at the footing's edge that had folded and were re-derived leave white slits.
+    Domains at the footing's edge that became inverted and were replaced leave white gaps.
     """
     from matplotlib.collections import PolyCollection
 
@@ -407,7 +410,7 @@ def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
 
 
 def block(ax, frame: Frame) -> None:
-    """Draw the footing, and the soil's first surface."""
+    """Draw the footing, and the initial surface of the soil."""
     from matplotlib.patches import Rectangle
 
     place = (-WIDTH / 2, -frame.settlement * WIDTH)
@@ -417,7 +420,7 @@ def block(ax, frame: Frame) -> None:
 
 
 def scale(run: Push) -> tuple[float, float]:
-    """Return the ends of the colours, in c, that show the pressures of a push."""
+    """Return the limits of the colour scale, in c, for the pressures of a push."""
     return 0.0, max(float(np.quantile(frame.pressure, 0.99)) for frame in run.frames) / COHESION
 
 

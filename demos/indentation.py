@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A rigid cylinder is pressed into a wet gel and held, and its force relaxes as the gel drains.
 
-Plane strain; half of the gel, 5 m wide and high, on a smooth base.  It drains at its side, far from the cylinder, which
-moves down at once.
+In plane strain, half of the gel is computed.  It is 5 m wide and high, lies on a smooth base, and drains at its side,
+far from the cylinder.  The cylinder moves down at once.
 
 * Immediately no water flows and the gel is incompressible.  The pressure under the cylinder is Hertz's,
 
@@ -53,7 +53,7 @@ class Contact:
 
 
 def contact(s: mpm.Simulation) -> Contact:
-    """Return the present contact: p^2 is linear in x^2."""
+    """Return the present contact, from a fit of p^2 linear in x^2."""
     p, x = s.points.data["ball_pressure"], s.points.x[:, 0]
     on = p > 0
     order = np.argsort(x[on])
@@ -64,7 +64,7 @@ def contact(s: mpm.Simulation) -> Contact:
 
 
 def scene(cells: int, wet: bool) -> mpm.Simulation:
-    """Return half of the gel under the cylinder, with a number of cells to a metre."""
+    """Return half of the gel under the cylinder, with a number of cells per metre."""
     n, h = round(SIZE * cells), 1 / cells
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
     top = SIZE + 0.3 * h  # the surface is no line of the grid
@@ -139,7 +139,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
-    """Draw pore pressures at once, pressures under the cylinder with Hertz's, and the force in time."""
+    """Draw initial pore pressures, pressures under the cylinder with Hertz's solution, and the force over time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")

@@ -2,9 +2,9 @@
 """Water infiltrates unsaturated soil, with exact and converged solutions.
 
 Left: rain on exponential soil (`Gardner`) above a water table.  The rain is a tenth of the conductivity until t = 0,
-and nine tenths after; heads against the series of Srivastava and Yeh (1991).  Right: a wet surface above dry soil
-(`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990), against a converged solution of Richards'
-equation, and against finite elements (Q1/DG0) on the same cells with the same steps.
+and nine tenths of it after that.  Heads are compared with the series of Srivastava and Yeh (1991).  Right: a wetting
+front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  It is compared with a
+converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells with the same steps.
 
 Errors: for the rain, the largest error of a head at 1, 6 and 12 h over the largest head at that time.  For the front,
 the position of the head -5 m and the infiltrated water, at 6 and 12 h, of material points and of elements.  On one
@@ -26,7 +26,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}
-"""Depth of the head of -5 m, and water taken in, m, by hour: 1600 finite volumes, extrapolated."""
+"""By hour: depth of the head of -5 m, and infiltrated water, m, of 1600 finite volumes, extrapolated."""
 DRY = {
     "soil": mpm.LinearElastic(
         **STIFF,
@@ -41,7 +41,7 @@ DRY = {
 
 
 def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
-    """Return a column of 1 m between smooth walls, its stresses in balance with weight and suction."""
+    """Return a column of 1 m between smooth walls, with stresses in equilibrium with weight and suction."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [h, 1 + 2 * h], [1, cells + 2])
     scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "gravity": (0, -9.81)}
@@ -67,7 +67,7 @@ def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> 
 
 
 def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
-    """Return heights and heads of the cells at the hours, the errors, and whether the run has converged."""
+    """Return the cells' heights and heads at each of `HOURS`, the errors, and whether the run converged."""
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=K, retention=mpm.Gardner(WEIGHT / ALPHA))
     sides = [mpm.Drained("bottom"), mpm.Rain("top", 0.9 * K)]
     s = column(cells, soil, lambda x: WEIGHT / ALPHA * np.log(0.1 + 0.9 * np.exp(-ALPHA * x[:, 1])), sides)
@@ -83,7 +83,7 @@ def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
 
 
 def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
-    """Return depths and heads of the cells at 6 and 12 h, errors of the front, m, and of the water, and as `rain`."""
+    """Return depths and heads of the cells at 6 and 12 h, errors of front, m, and water, and whether it converged."""
     s = column(cells, **DRY)
     start = s.cells().water.sum()
     found, places, waters = [], [], []

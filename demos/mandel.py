@@ -12,8 +12,8 @@ Errors:
 
 * `p_0.01` to `p_1`: the largest over the cells of |p - exact| a / force at T = 0.01, 0.1, 0.5 and 1, at the centroid of
   the cell;
-* `p_max`: of the highest pressure in the innermost cell, at T = 0.07, relative;
-* `p_rise`, stricter: of its rise above p0;
+* `p_max`: the relative error of the highest pressure in the innermost cell, at T = 0.07;
+* `p_rise`, which is stricter: the relative error of the rise of this pressure above p0;
 * `settlement`: the largest relative error of the plate's settlement at these times.
 
 Most of the error is spatial: it falls with the square of the cell size.
@@ -58,7 +58,7 @@ class Outcome:
 
 
 def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[str, float], Outcome]:
-    """Consolidate the quarter to T = 1; the stages from 0 and from each of SAMPLES to the next take `steps` each.
+    """Consolidate the quarter to T = 1, with `steps` steps from 0 to the first of SAMPLES and between any two.
 
     Returns the errors that the module's docstring defines, and the histories.
     """
@@ -91,7 +91,7 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
 
 
 def exact_peak(x: float) -> float:
-    """Return the highest pressure that a place ever has, Pa."""
+    """Return the highest pressure at a position at any time, Pa."""
     return float(EXACT.pressure(x, np.geomspace(1e-3, 1, 5001) * WIDTH**2 / EXACT.cv).max())
 
 

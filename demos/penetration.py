@@ -7,17 +7,19 @@ clay flows all around it.  Then its resistance is that of Randolph and Houlsby (
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
 Half of the clay, a block eight diameters wide and high, lies between smooth walls.  A pressure on its top keeps the gap
-behind the bar closed.  The pressure settles the clay, so it first loads the bar downwards.  In a narrower block the
-resistance is lower: four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 for a rough bar.
+behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.  In a
+narrower block the resistance is lower: four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 for a
+rough bar.
 
-Clay ahead of the bar divides and stretches exponentially, by about e^4 over a diameter.  The clay is therefore seeded
-again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu and
-Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  For a step or two N is
-lower then.  Errors refer to the mean of N over the last part of each quarter, and `spread` is its variation there.
+Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  The clay is therefore
+seeded again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu
+and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each
+new seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter, and
+`spread` is its variation there.
 
 Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v.  Water of the same pressure
-stands on top, so the clay starts without effective stress.  It is seeded once.  The domains ahead of the bar are
-narrower at first, by their later stretch, and end as wide as the others.
+stands on top, so the clay starts without effective stress.  Wet clay is seeded only once.  The domains ahead of the bar
+are narrower at first, in proportion to their later stretch, and end as wide as the others.
 
 With --follow the bar is pushed once more, through small cells that move with it.  Grid lines follow the bar: their
 number stays, and the cells around the small ones widen behind the bar and narrow ahead of it.
@@ -63,7 +65,7 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return angles, 0 ahead of the bar, between a number of domains, more where widths fall to `nose` times theirs."""
+    """Return the angles between domains; ahead of the bar, at 0, widths fall to `nose` times the other widths."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -73,9 +75,9 @@ def angles(around: int, nose: float) -> np.ndarray:
 
 
 def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
-    """Return a grid by its cells over the diameter, half of the block around a bar at y, m, and its top's region.
+    """Return the grid, with a number of cells over the diameter, half of the block around a bar at y, m, and its top.
 
-    follow: the bar, for lines that follow it.
+    follow: the bar, if grid lines follow it.
     """
     h = D / cells
     n = round(HALF * cells)
@@ -101,11 +103,11 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
 @dataclass
 class Push:
-    """A push, a step each: depths over D, resistances over s_u D, whether they count, and excess pressures over s_u.
+    """A push, by step: depths over D, resistances over s_u D, whether they are used, and excess pressures over s_u.
 
     frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
-    motion of the points over that of the bar since the clay was seeded, or the excess pressure of wet clay over s_u.
-    lines: then, along both axes, m.
+    displacement of the points over that of the bar, since the clay was seeded.  In wet clay it is the excess pressure
+    over s_u. lines: then, along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -120,7 +122,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Press the clay, then push a bar of roughness alpha to a depth, over D, with clay seeded again in each part.
+    """Load the clay, then push a bar of roughness alpha to a depth, over D; the clay is seeded again in each part.
 
     follow: whether grid lines follow the bar.
     """
@@ -131,7 +133,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar at y over D by a way, over D, from stresses or after pressing the clay; return the stresses then."""
+    """Push a bar at y over D by a distance over D, from given stresses or the loaded clay; return final stresses."""
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
@@ -157,7 +159,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return the effective stress (n, 3, 3), Pa, at places x (n, 2), between the points and as the clay can bear it."""
+    """Return the effective stress (n, 3, 3), Pa, at positions x (n, 2), interpolated and within the strength."""
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
     between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
@@ -244,7 +246,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar through lines that follow it; return its resistance and cells, over those in equal cells."""
+    """Push a bar through lines that follow it; return resistance and number of cells, relative to equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))
@@ -267,7 +269,7 @@ def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
 
 
 def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
-    """Draw resistances, how far the clay has moved around the smoothest and the roughest bar, and pore pressures."""
+    """Draw resistances, displacements of the clay around the smoothest and the roughest bar, and pore pressures."""
     fig, axes = common.figure(2, 4, (17, 8.5))
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")

@@ -2,9 +2,9 @@
 """A poroelastic beam of 1 m x 0.3 m: a saturated cantilever under a constant load.
 
 A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load rises linearly
-over the ramp and then stays.  The ends of the beam are permeable, and its long sides are no-flow.  It is in plane
-strain, or 0.1 m deep between smooth walls (--dim 3), which is equivalent.  At first the pore water carries a part of
-the load.  The beam drains and sags by a third of its length.  Two other solutions are shown.  One is
+over the ramp and then remains constant.  The ends of the beam are permeable, and its long sides are no-flow.  It is in
+plane strain, or 0.1 m deep between smooth walls (--dim 3), which is equivalent.  At first the pore water carries a part
+of the load.  The beam drains and sags by a third of its length.  Two other solutions are shown.  One is
 Euler-Bernoulli's small-strain beam without water.  The other (--reference) is a body-fitted Taylor-Hood finite element
 solution of the same finite-strain Biot problem, in steps of a quarter of --dt.
 """
@@ -29,9 +29,9 @@ REFERENCE_CELLS = (67, 20)
 TIMES = (0.02, 0.04, 0.06, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2)  # s
 TRUTH = (-0.0665718, -0.1444268, -0.2306306, -0.2652579, -0.3085867)
 TRUTH += (-0.3378547, -0.3453412, -0.3474797, -0.3481624, -0.3484207)
-"""u_y of the tip (m) at TIMES by Taylor-Hood elements, REFERENCE_CELLS, steps of 0.005 s (--reference prints it).
+"""u_y of the tip (m) at TIMES by Taylor-Hood elements, REFERENCE_CELLS, steps of 0.005 s (printed by --reference).
 
-Steps of 0.0025 s change the last digit but one, 100 x 30 cells the fifth.
+Steps of 0.0025 s change the last digit but one; 100 x 30 cells change the fifth digit.
 """
 
 
@@ -167,7 +167,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
-    """Return the finite elements' result at the times of another, of the places (n, 2), m, of the beam's axis."""
+    """Return the finite element result at the times of another result, for positions (n, 2), m, on the axis."""
     fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
     at = [int(np.argmin(np.abs(found.t - t))) for t in result.t]

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Rain on slopes that suction stabilises: factors of safety in time, with exact limits, and a bank that slides.
 
-A slope of 35 degrees is much longer than deep, so the problem is one-dimensional across it.  A column stands on a water
-table 5 m below the surface, under the component of gravity across the slope.  It starts at rest.  Then rain falls
-vertically, nine tenths of the conductivity, until the flow is steady.  At a depth d (vertical)
+A slope of 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  A column stands
+on a water table 5 m below the surface, under the component of gravity normal to the slope.  It starts at rest.  Then
+rain falls vertically, nine tenths of the conductivity, until the flow is steady.  At a depth d (vertical)
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
 
 with the suction stress chi s of Bishop and a constant unit weight gamma.  Before and after the storm this is exact for
 exponential soil: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), z above the table.
 
-Source: Lu and Godt (2008) for vertical flow; across the slope, gravity is its component.  Errors: the largest error
-of FS at 1, 2, 3 and 5 m, at rest and at the end.
+Source: Lu and Godt (2008) for vertical flow; normal to the slope, gravity is replaced by its component.  Errors: the
+largest error of FS at 1, 2, 3 and 5 m, at rest and at the end.
 
-With `--slope 10` rain falls on a bank of soil on rough rock, 5 m high, at 60 degrees.  Suction and a cohesion that slip
-destroys hold it.  The suction fades until no equilibrium is left.  With inertia the bank then slides, runs out over the
-rock and comes to rest.  An animation shows both.  Checks: energies and water balance.  On 6 and 10
-cells over its height it fails after 1.7 and 1.5 h, and runs out by 3.2 and 2.7 m.  On one process.
+With `--slope 10` rain falls on a bank of soil on rough rock, 5 m high, at 60 degrees.  Suction and a cohesion that
+vanishes with slip stabilise the bank.  The suction decreases until equilibrium is impossible.  With inertia the bank
+then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks: energies and
+water balance.  On 6 and 10 cells over its height it fails after 1.7 and 1.5 h, and runs out by 3.2 and 2.7 m.  On one
+process.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ BALANCE = 0.01  # share of the work of the weight by which energies may be off
 
 
 def column(cells: int) -> mpm.Simulation:
-    """Return the column at rest with cells across the slope, and its foot at the water table."""
+    """Return a column normal to the slope, `cells` cells high, at rest, with its base at the water table."""
     height = TABLE * np.cos(SLOPE)
     h = height / cells
     grid = mpm.Grid([0, 0], [h, height + 2 * h], [1, cells + 2])
@@ -73,7 +74,7 @@ class Shot(NamedTuple):
 
 
 def bank(cells: int) -> mpm.Simulation:
-    """Return a bank with cells over its height, on rough rock, in rain on its top and its slope."""
+    """Return a bank, `cells` cells high, on rough rock, with rain on its top and its slope."""
     h = BANK / cells
     toe = CREST + BANK / np.tan(BANK_ANGLE)
     width = np.ceil(RANGE / h) * h
@@ -98,7 +99,7 @@ def bank(cells: int) -> mpm.Simulation:
 
 
 def slide(o: Namespace) -> dict:
-    """Let the bank fail and run out; return what came of it, and draw it."""
+    """Let the bank fail and run out; return its results, and draw it."""
     s = bank(o.slope)
     start = float(s.cells().water.sum())
     film = [shot(s)]
@@ -133,13 +134,13 @@ def slide(o: Namespace) -> dict:
 
 
 def shot(s: mpm.Simulation) -> Shot:
-    """Return the bank as it is."""
+    """Return a shot of the present bank."""
     speed = np.linalg.norm(s.points.data["velocity"], axis=1).max() if "velocity" in s.points.data else 0.0
     return Shot(s.t, s.points.corners.copy(), s.point_fields().saturation, float(speed))
 
 
 def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
-    """Draw the bank before the rain, as it fails and at rest again, and an animation; rained: shots until it fails."""
+    """Draw the bank before the rain, at failure and at rest, and an animation; rained: number of shots to failure."""
     fig, (panels,) = common.figure(1, 3, (13, 3.2))
     failed = film[rained - 1].t
     titles = ("before the rain", f"{failed / 3600:.1f} h: it fails", f"{film[-1].t - failed:.0f} s later")
@@ -192,20 +193,20 @@ def animate(path: Path, film: list[Shot], rained: int) -> None:
 
 
 def exact(depth: np.ndarray, share: float) -> np.ndarray:
-    """Return the exact factors of safety at depths (m), of a rain that is a share of the conductivity."""
+    """Return the exact factors of safety at depths (m), for a rain given as a fraction of the conductivity."""
     filled = share + (1 - share) * np.exp(-ALPHA * (TABLE - depth) * np.cos(SLOPE) ** 2)
     return safety(depth, -filled * np.log(filled) / ALPHA * WATER)
 
 
 def safety(depth: np.ndarray, suction_stress: np.ndarray) -> np.ndarray:
-    """Return the factors of safety at depths (m), by chi s (Pa)."""
+    """Return the factors of safety at depths (m), from the suction stress chi s (Pa)."""
     angles = np.tan(SLOPE) + 1 / np.tan(SLOPE)
     held = 2 * COHESION / (UNIT * depth * np.sin(2 * SLOPE)) + np.tan(FRICTION) / np.tan(SLOPE)
     return held + suction_stress / (UNIT * depth) * angles * np.tan(FRICTION)
 
 
 def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return depths, m, heads, m, and chi s, Pa, of the cells from the surface down."""
+    """Return depths, m, heads, m, and suction stresses chi s, Pa, of the cells from the surface down."""
     cell = s.cells()
     depth = TABLE - cell.x[::-1, 1] / np.cos(SLOPE)
     p = cell.pressure[::-1]
@@ -214,7 +215,7 @@ def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
-    """Return the largest error of the factors of safety at `DEPTHS`; at the table itself there is no suction."""
+    """Return the largest error of the factors of safety at `DEPTHS`; the suction at the water table is zero."""
     at = np.interp(DEPTHS, np.append(depth, TABLE), np.append(suction_stress, 0.0))
     return float(np.abs(safety(DEPTHS, at) / exact(DEPTHS, share) - 1).max())
 

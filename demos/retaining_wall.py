@@ -8,11 +8,12 @@ With c cot(phi) added to both, which removes the effect of cohesion,
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
 the upper sign passive: a zone at the wall, a fan about its crest and Rankine's zone (Prandtl, Sokolovskii).  Without
-friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the critical plane one.
+friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the critical one with a
+plane slip surface.
 
 The moment about the toe is conjugate to the rotation and gives K as well.  A tilting wall opens no gap at its toe.  A
-translating wall opens one and carries nothing there: the last of ten cells misses a tenth of the active thrust.  The
-sand is stiff: at two and a half times the tilt, the active thrust rises by 2.5 to 3 %.
+translating wall opens a gap and carries nothing there: without the last of ten cells, the active thrust is a tenth too
+small.  The sand is stiff.  At two and a half times the tilt, the active thrust rises by 2.5 to 3 %.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class Tilted:
 
 
 def tilted(name: str, delta: float, cells: int) -> Tilted:
-    """Load the sand, then tilt the wall in the way that `name` says."""
+    """Load the sand, then tilt the wall in the direction that `name` gives."""
     way, length, h, mu = WAYS[name], LENGTH[name], 1 / cells, np.tan(np.radians(delta))
     grid = mpm.Grid([-4 * h, -2.5 * h], [length, 1 + 5.5 * h], [round(length / h) + 4, cells + 8])
     turn = {"rotation_rad": lambda t: -way * TILT[name] * max(0, t - 1)}

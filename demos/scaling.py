@@ -4,16 +4,16 @@
 Two saturated bodies move slowly through the grid.  One is the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
 background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Every run is
 its own process, or several under mpirun (--processes 1 2).  The first step compiles and fills the caches.  Then single
-steps are measured, and the fastest counts, since other work on the machine only adds.  Time is processor time, shared
-among the parts in proportion to the clock.  On several processes it is the largest of all, including waits.  Memory is
-the peak since the start of the process, with libraries and compiler.  Under mpirun itself all runs share its processes,
-and memory is the peak so far.
+steps are measured.  The fastest is used, since other work on the machine only adds time.  Time is processor time,
+shared among the parts in proportion to the clock.  On several processes it is the largest time of all processes,
+including waits.  Memory is the peak since the start of the process, with libraries and compiler.  Under mpirun itself
+all runs share its processes, and memory is the peak so far.
 
 The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the sizes.
 The memory's slope, `kB a point`, is over all sizes, by least squares of relative errors.  Runs on several processes
-also print the load balance (`imbalance`: the most pieces of a process over the mean) and the traffic of a step, the
-largest of all processes.  `exchange` is the package's own (pieces, corners, points).  `solvers` is PETSc's count in
-set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
+also print the load balance (`imbalance`: largest number of pieces of a process over the mean) and the traffic of a
+step, the largest of all processes.  `exchange` is the traffic of the package (pieces, corners, points).  `solvers` is
+PETSc's count in set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
 
@@ -21,8 +21,8 @@ With runs on one and on several processes, a cost model is fitted to the seconds
 
 a fixed cost, work of the points (of a run, times its imbalance), halo, and messages of any size.  All terms are >= 0,
 by least squares of relative errors.  H is the number of points along the faces between processes, for a cube that is
-halved repeatedly.  Runs on more processes than processors count for messages only.  In 2D the solvers are left out:
-the cost of factorisations is not n / P.
+halved repeatedly.  If a run has more processes than the machine has processors, its message counts are used, but not
+its times.  In 2D the solvers are left out: the cost of factorisations is not n / P.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def exponents(rows: list[dict]) -> dict[str, float]:
 
 
 def halo(dim: int, n: float, processes: int) -> float:
-    """Return how many points lie along the faces that a process shares with others; processes: a power of two."""
+    """Return the number of points along the faces that a process shares with others; processes: a power of two."""
     turn = round(np.log2(processes))
     halved = np.array([turn // dim + (axis < turn % dim) for axis in range(dim)])
     sides = n ** (1 / dim) / 2.0**halved
@@ -182,7 +182,7 @@ def fit(rows: list[dict]) -> dict[str, float]:
 
 
 def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> float:
-    """Return the model's seconds of a step."""
+    """Return the predicted seconds of a step."""
     return float(np.dot(terms(dim, n, processes), [model[name] for name in "eabc"]))
 
 

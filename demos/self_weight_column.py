@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """A soft column settles to less than half its height under its own weight.
 
-A dry column of 50 m stands between smooth walls, E = 10 kPa, nu = 0, 80 kg/m³.  Gravity, raised to 10 m/s² in equal
-steps, compresses it to 24.06 m, and its foot to 0.3 of its length, so points cross many cells.  The first
-Piola-Kirchhoff stress at the reference height Y carries the weight above, P = -rho0 g (l0 - Y).  In a column of
-constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lambert's W.  Source: the column of AMPLE
-(Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On one process.
+A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  It stands between smooth walls.  Gravity,
+raised to 10 m/s² in equal steps, compresses it to 24.06 m, and its foot to 0.3 of its length, so points cross many
+cells.  The first Piola-Kirchhoff stress at the reference height Y carries the weight above, P = -rho0 g (l0 - Y).  In a
+column of constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lambert's W.  Source: the column
+of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On one process.
 
 Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0), and the
 relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the initial height, 4.4e-4
@@ -31,7 +31,7 @@ FOAM = mpm.Hencky(bulk=EXACT.bulk, shear=EXACT.shear, porosity=POROSITY, grain_d
 
 @dataclass
 class Outcome:
-    """The column at rest: heights Y before and y now (n,), m, vertical stress (n,), Pa, and volume0 of the points."""
+    """The column at rest: initial heights Y and present ones y (n,), m, stress (n,), Pa, and volume0 of the points."""
 
     Y: np.ndarray
     y: np.ndarray
@@ -42,7 +42,7 @@ class Outcome:
 
 
 def run(cells: int = 64, steps: int = 40, quadrature: str = "domain") -> Outcome:
-    """Load the column, that many cells high, in equal steps."""
+    """Load the column, `cells` cells high, in equal steps."""
     h = EXACT.l0 / cells
     grid = mpm.Grid([0, 0], [h, EXACT.l0], [1, cells])
     column = mpm.box(grid, [0, 0], [h, EXACT.l0], per_cell=2)

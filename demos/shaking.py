@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """A shear wave rises from the ground into a soft layer: amplification at its surface against the exact one.
 
-A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  An absorbing base 5 m below truncates the ground.
-A shear pulse enters through the base, and reflections from layer and surface leave through it.  The sides have no
-vertical displacement, as in an infinite layer.  The reference is twice the incoming wave, the motion of a free
-surface of the ground alone.  The spectrum of the surface over this reference is
+A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  An absorbing base 5 m below truncates the ground.  A
+shear pulse enters through the base, and reflections from layer and surface leave through it.  The sides have no
+vertical displacement, as in an infinite layer.  The reference is twice the incoming wave, the motion of a free surface
+of the ground alone.  The ratio of the spectrum of the surface to that of the reference is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
@@ -28,14 +28,14 @@ BOUNDS = {"amplification": 0.03, "energy": 0.01}
 
 
 def soil(speed: float, density: float) -> mpm.LinearElastic:
-    """Return a soil of this speed of shear waves, m/s, and density, kg/m³."""
+    """Return a soil with the given velocity of shear waves, m/s, and density, kg/m³."""
     shear = density * speed**2
     bulk = 2 * shear * (1 + POISSON) / (3 - 6 * POISSON)
     return mpm.LinearElastic(bulk=bulk, shear=shear, porosity=0.4, grain_density=density / 0.6)
 
 
 def incoming(t: np.ndarray) -> np.ndarray:
-    """Return the velocity, m/s, of the wave that comes in: Ricker's wavelet."""
+    """Return the velocity, m/s, of the incoming wave, Ricker's wavelet."""
     s = (np.pi * PULSE * (t - CENTRE)) ** 2
     return 0.1 * (1 - 2 * s) * np.exp(-s)
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety of a slope, and its run-out after a larger loss of strength.
 
-A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil: phi = 20 degrees, c / (gamma H) = 0.05, no dilation.
+A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, without
+dilation.
 
-1. By how much may c and tan(phi) be divided?  `mpm.factor_of_safety` weakens the slope at rest, and checks if the
-   excess over the strength dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
-   Lane 1999).
+1. By how much may c and tan(phi) be divided?  `mpm.factor_of_safety` reduces the strength of the slope at rest, and
+   checks whether the stress in excess of the strength decays.  The best log-spiral mechanism gives 1.368, finite
+   elements 1.4 (Griffiths and Lane 1999).
 2. The strength is divided by 1.6 at once, in soil with the viscosity eta.  The slope slides until its new shape is
    just stable: its factor of safety is then one, to a tenth.
 """
@@ -95,7 +96,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
-    """Draw the overloads of the trials, and the slope before and after its slide."""
+    """Draw the excess stresses (overloads) of the trials, and the slope before and after its slide."""
     fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
     for factor, shares in sorted(safety.overloads.items()):
         rests = factor <= safety.bounds[0]

@@ -6,22 +6,22 @@ is computed, x = 0 is a plane of symmetry.  Pressures are in excess of the water
 gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On one process.
 
 1. Critical strength.  Without friction and drainage, the strength c is lowered by 1 % a step.  A vertical side of
-   height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
-   2000; the best circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
-   step as at first; 10 or 40 times move the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and
-   3.85, 3.9 and 1.9 % too late.  The error is of first order in the cell size, and the extrapolated value is 3.78.
+   height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato 2000;
+   the best circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a step as at
+   first; 10 or 40 times change the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and 3.85,
+   which is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value is 3.78.
 2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, far faster than it drains.
-   It slumps, and its crest rides on the flowing soil.  Before the toe, the water carries more than half of the
-   weight.  At rest the bank reaches twice as far as before; then the excess pressure drains.  The final slope is 23.5
-   degrees, and 29.3 over the steepest stretch of length H / 3.  The friction angle is 25.  A Drucker-Prager cone
-   without dilation mobilises arcsin(eta) = 24.2 of it; the last hundredth of cohesion adds a little.  Twice the cells
+   It slumps, and its crest rides on the flowing soil.  Before the toe, the water carries more than half of the weight.
+   At rest the bank reaches twice as far as before; then the excess pressure drains.  The final slope is 23.5 degrees,
+   and 29.3 over the steepest stretch of length H / 3.  The friction angle is 25 degrees; a Drucker-Prager cone without
+   dilation mobilises only arcsin(eta) = 24.2.  The remaining hundredth of the cohesion adds a little.  Twice the cells
    or the steps, or half the viscosity, change run-out and height by less than 2 %.
 
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  An observer lowers it
-between two steps.  A step without convergence is cut and repeated with the same strength.  This helps because a
-viscous stress 2 eta D, a term in UFL like the weight, limits the velocity of the bank.  eta / T is a hundredth of
-gamma' H; part 1 has no viscosity.  No mesh could follow: the side of the bank ends on the floor, at plastic strains
-of several hundred per cent.
+between two steps.  A step without convergence is cut and repeated with the same strength.  This helps because a viscous
+stress 2 eta D, a term in UFL like the weight, limits the velocity of the bank. eta / T is a hundredth of gamma' H; part
+1 has no viscosity.  A mesh could not represent this deformation: the side of the bank ends on the floor, at plastic
+strains of several hundred per cent.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank by the cells over its height, `room` m before it, and a probe on its crest."""
+    """Return the consolidated bank, with cells over its height and `room` m before it, and a probe on its crest."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -87,7 +87,7 @@ class Failure:
 
 
 def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
-    """Lower the strength of an undrained bank without friction until its crest runs away."""
+    """Lower the strength of an undrained bank without friction until its crest settles without bound."""
     s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[common.weight(WEIGHT)])
     number, settlement, rate = [start], [0.0], np.zeros(0)
     while len(rate) < 10 or rate[-1] < 2 * RUNAWAY:
@@ -123,7 +123,7 @@ class Frame:
 
     @property
     def run_out(self) -> float:
-        """How far the bank reaches, m."""
+        """Run-out of the bank, m."""
         return float(self.corners[:, :, 0].max())
 
     @property
@@ -143,7 +143,7 @@ class Frame:
 class Slump:
     """Results of a run; `rest` and `drained` are the indices of the frames at which the two stages end.
 
-    alternating: rms, Pa, of the part of the pressures before the bank that alternates from cell to cell, at most.
+    alternating: largest rms, Pa, of the part of the pressures before the bank that alternates from cell to cell.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -196,7 +196,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Give the next step the strength of its end."""
+        """Set the strength at the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 
@@ -337,14 +337,14 @@ def draw(path: Path, run: Slump) -> None:
 
 
 def time(seconds: float) -> str:
-    """Return a time in a fitting unit."""
+    """Return a time as text, in a suitable unit."""
     units = {"years": 365.25 * 86400, "days": 86400, "h": 3600, "min": 60}
     name = next((name for name, unit in units.items() if seconds >= unit), "min")
     return f"{seconds / units[name]:.3g} {name}"
 
 
 def draw_failure(path: Path, failures: list[Failure]) -> None:
-    """Draw how fast the crest settles over the stability number."""
+    """Draw the settlement rate of the crest against the stability number."""
     fig, ((ax,),) = common.figure(1, 1, (6.5, 4))
     for f in failures:
         (line,) = ax.semilogy(f.number, f.rate, ".-", label=f"{f.cells} cells over the height")
@@ -358,7 +358,7 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
 
 
 def animate(path: Path, run: Slump) -> None:
-    """Draw the slump as an animation, whose clock goes faster from part to part."""
+    """Draw the slump as an animation, whose clock runs faster from part to part."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     weak = int(np.argmax([f.cohesion <= 1.001 * WEAK for f in run.frames]))

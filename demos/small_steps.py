@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Error as the time step tends to zero: it becomes the spatial error, at rest and in motion.
 
-Terzaghi's column (demo `terzaghi`) is taken to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1 to
-1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, at the centroid
-of each cell.  The error of time integration falls with the step.  The rest must be the spatial error, which an exact
-solution in time of the semi-discrete equations gives.  It must stay constant for any number of steps: a pressure
-averaged to points and back in every step would diffuse.  Three columns:
+Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1
+to 1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, at the
+centroid of each cell.  The error of time integration falls with the step.  The remaining error must be the spatial
+error, which an exact solution in time of the semi-discrete equations gives.  The spatial error must stay constant for
+any number of steps: a pressure averaged to points and back in every step would diffuse.  Three columns:
 
 * resting on the grid;
-* moving: meanwhile its foot is carried down by half the height, through half of all cells;
+* moving: during consolidation the base moves down by half the height, through half of all cells;
 * moving, soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of stiff water follows from the
   strain of the points.  The pressure of soft water is also remapped from grid to grid.
 
-Motion adds an error: all points of a cell share its strain in a step.  It is largest at the drained top, in cells with
-little of the column.  The error of the remap itself is of second order and smaller.
+Motion adds an error, because all points of a cell have the same strain increment in a step.  This error is largest at
+the drained top, in cells with little of the column.  The error of the remap itself is of second order and smaller.
 
 The overshoot, the largest p / p0 - 1 of all steps, is zero at rest for any step.  So the scheme has no smallest time
 step in one dimension.  In more dimensions, small steps cause checkerboard modes of the pressure, unless its jumps are
@@ -39,7 +39,7 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""Way of the foot over the height, and the water's storage coefficient times M."""
+"""Displacement of the base over the height, and the water's storage coefficient times M."""
 STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the layer's time of consolidation
 
 
@@ -54,7 +54,7 @@ class Run:
 
 
 def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, strain: float = 1e-5) -> Run:
-    """Consolidate a column to T_END in equal steps while its foot moves down by way * HEIGHT."""
+    """Consolidate a column to T_END in equal steps while its base moves down by way * HEIGHT."""
     h, modulus = HEIGHT / cells, SOIL.oedometric
     load, p0 = strain * modulus, strain * modulus / (1 + softness)
     water = mpm.Fluid(bulk=SOIL.porosity * modulus / softness if softness else np.inf)
@@ -84,7 +84,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
 
 
 def error_of_cells(cells: int) -> float:
-    """Return the same error on equal cells with exact time: two-point fluxes and the damping of small steps."""
+    """Return the same error on equal cells for exact time integration: two-point fluxes and damping of small steps."""
     laplacian = 2 * np.eye(cells) - np.eye(cells, k=1) - np.eye(cells, k=-1)
     laplacian[0, 0] = laplacian[-1, -1] = 1
     outflow = laplacian.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Large consolidation under a strip load: a layer as deep as wide settles by an eighth, and closes its pores.
+"""Large consolidation under a strip load: a layer as deep as wide settles by an eighth, and its porosity falls.
 
 A layer between smooth walls on a smooth, impervious base carries a dead load q on a fifth of its drained surface.
 Half of it is computed, x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6.  Its
@@ -41,7 +41,7 @@ UNIT = WATER.unit_weight * HEIGHT**2 / (K0 * E)  # s, T = 1
 RAMP = 0.01  # T
 PLACES = np.array([[0.0, HEIGHT], [STRIP, HEIGHT], [HEIGHT, HEIGHT]])
 TIMES = (0.01, 0.1, 10**-0.5, 1.0, 10**0.5)
-"""T of the elements' values."""
+"""Reduced times T of the reference values."""
 ELEMENTS = np.array(
     [
         [-0.058309, -0.032099, 0.020442],
@@ -51,7 +51,7 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Displacements (TIMES, PLACES), up, over HEIGHT, of Taylor-Hood elements for q/E = 0.25, extrapolated."""
+"""Upward displacements (TIMES, PLACES) over HEIGHT, of Taylor-Hood elements for q/E = 0.25, extrapolated."""
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
@@ -62,16 +62,16 @@ def conditions(load: float) -> dict:
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the ends T of the steps: two thirds as many to RAMP as there are in each decade from there on."""
+    """Return the ends T of the steps: up to RAMP, two thirds of the number of steps in each later decade."""
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
 
 
 @dataclass
 class Outcome:
-    """Histories: T, and displacements of PLACES over HEIGHT, up.
+    """Histories: T, and upward displacements of PLACES over HEIGHT.
 
-    frames: T, corners, pressure over E and porosity of the points; why: why it ended early.
+    frames: T, corners, pressure over E and porosity of the points; why: reason of an early end.
     """
 
     T: list[float] = field(default_factory=list)
@@ -84,7 +84,7 @@ class Outcome:
 
 
 def run(cells: int = 40, load: float = 0.25, a_decade: int = 30) -> Outcome:
-    """Consolidate a layer of that many cells in its height under a load over E."""
+    """Consolidate a layer, `cells` cells high, under a load over E."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [HEIGHT, HEIGHT + 4 * h], [cells, cells + 4])
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
@@ -111,7 +111,7 @@ def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the displacements (times, PLACES) of Taylor-Hood elements, up, over HEIGHT, at TIMES."""
+    """Return the upward displacements (times, PLACES) of Taylor-Hood elements over HEIGHT, at TIMES."""
     fem, out = BiotFEM([0, 0], [HEIGHT] * 2, [cells] * 2, SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)
@@ -158,7 +158,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure at first, the porosity in the end, and the displacements of the surface over time."""
+    """Draw the initial pressure, the final porosity, and the displacements of the surface over time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (14, 4.4))
     kinds = (("pore pressure / E (-)", 2, "viridis"), ("porosity (-)", 3, "cividis"))
     for ax, (T, *values), (label, k, colours) in zip(

@@ -32,7 +32,7 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """Results of a run, an entry for each output: T_v, depth and p of the cells, settlement, over their scales."""
+    """Results of a run, by output time: T_v, depth and p of the cells, settlement, over their scales."""
 
     result: mpm.Result
     time: list[float] = field(default_factory=list)
@@ -48,7 +48,7 @@ class Outcome:
 def run(
     cells: int = 50, steps: int = 100, strain: float = 1e-5, method: str = "sdirk2", rtol: float | None = None
 ) -> Outcome:
-    """Consolidate a column of that many cells to T_v = 1 under a load that strains it by `strain`.
+    """Consolidate a column of `cells` cells to T_v = 1 under a load that strains it by `strain`.
 
     In equal steps, or with `rtol` in steps chosen by their error.
     """

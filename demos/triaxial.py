@@ -6,10 +6,10 @@ Undrained the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kapp
 Q = M sqrt(P (P_c - P)).  Drained the path is q = 3 (p - p_0), and ends where it meets q = M p.  Mohr-Coulomb sand ends
 at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in Kirchhoff stresses, in compression and in extension.
 
-Errors refer to the ends, and are relative.
+Errors are relative, and refer to the final states.
 
 --cost N compresses a block of N x N cells of Drucker-Prager, Mohr-Coulomb and Cam Clay soil until all of it yields.
-Steps alternate, and the demo prints the processor time of a step over that of Drucker and Prager's.
+Steps alternate, and the demo prints the processor time of a step over that of Drucker-Prager soil.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def end_of(kind: str, R: float) -> float:
 
 
 def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
-    """Return by how much the sand's ends are off Mohr and Coulomb's surface, over the cell pressure."""
+    """Return the distance of the final stresses of the sand from the Mohr-Coulomb surface, over the cell pressure."""
     out = {}
     for strain, r in tests.items():
         tau = np.sort(np.diag(r.stress[-1])) * np.linalg.det(r.F[-1])
@@ -54,7 +54,7 @@ def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
 
 
 def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
-    """Return a block under p_0 on its free side, which is squeezed by a thousandth of its height in a second."""
+    """Return a block under p_0 on its free side, which is compressed by a thousandth of its height in a second."""
     h = 1 / cells
     grid = mpm.Grid([0] * 2, [1 + 2 * h] * 2, [cells + 2] * 2)
     squeeze = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
@@ -68,7 +68,7 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
     """Return the processor time of a step over that of Drucker and Prager's soil; each law takes a step in turn.
 
-    Sands are associated: others form bands within an even block.
+    Sands have associated flow; otherwise shear bands form in the uniform block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}

@@ -7,7 +7,7 @@ the lower one, the contact inclines.  The force along the path, over the vertica
 coefficient.
 
 A second scene is the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the actual
-force of the contact.  Both have the error of a few cells over the half-width.
+force of the contact.  The errors of both are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHOWN = (0.0, 1.0, 2.0, 3.0)
 
 
 def half_disc(grid: mpm.Grid, centre: tuple[float, float], up: float):
-    """Return a half-disc with its flat side at its centre, whose round side looks up (1) or down (-1)."""
+    """Return a half-disc with its flat side at its centre, whose round side faces up (1) or down (-1)."""
     flat = mpm.box(grid, [centre[0] - RADIUS, min(centre[1], centre[1] + up)], np.add(centre, [RADIUS, max(up, 0)]))
     return mpm.mapped(grid, flat, lambda x: centre + _round((x - centre) / RADIUS) * RADIUS)
 
@@ -37,7 +37,7 @@ def _round(x: np.ndarray) -> np.ndarray:
 
 
 def path(t: float) -> tuple[float, float]:
-    """Return the displacement of the upper gel, m: down, along, up."""
+    """Return the displacement of the upper gel, m: down, sideways, up."""
     down = -DOWN * min(t / TIMES[0], 1) - GAP * min(t / TIMES[0], 1)
     along = ALONG * np.clip((t - TIMES[0]) / (TIMES[1] - TIMES[0]), 0, 1)
     return along, down + UP * np.clip((t - TIMES[1]) / (TIMES[2] - TIMES[1]), 0, 1)

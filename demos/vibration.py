@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Vibration of a beam and a bar: frequencies, and loss of energy, against exact values.
 
-1. A clamped beam, 1 x 0.3 m, in plane strain, is struck, across and along, so softly that small-strain theory is
-   accurate.  Its first bending frequency is 3.24419 Hz, by spectral elements graded to the clamp's corners.  The
-   first axial one is c / (4 L) = 17.67767 Hz, exactly.  The frequencies of the tip are fitted over three periods.
-2. A free bar, P = E (F - 1), vibrates with strains of 5 % and flies over fifty cells in 25 periods.  In an exact
-   solution its ends oscillate about the flight by A / (pi c) sin(pi c t / L), without loss of energy.  SDIRK2 itself
-   loses gamma^4 y^4 / (1 + gamma^2 y^2)^2, y = omega dt, of the energy in a step.  The rest is lost in resets of the
-   grid.
+1. A clamped beam, 1 x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
+   theory is accurate.  Its first bending frequency is 3.24419 Hz, by spectral elements graded to the clamp's corners.
+   The first axial one is c / (4 L) = 17.67767 Hz, exactly.  The frequencies of the tip are fitted over three periods.
+2. A free bar, P = E (F - 1), vibrates with strains of 5 % and moves over fifty cells in 25 periods.  In the exact
+   solution the ends oscillate about the uniform motion by A / (pi c) sin(pi c t / L), without loss of energy.  SDIRK2
+   itself loses gamma^4 y^4 / (1 + gamma^2 y^2)^2, y = omega dt, of the energy in a step.  The remaining loss is due to
+   resets of the grid.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LOST = 0.02  # share of the bar's energy that may be lost in 25 periods of 40 st
 
 
 class Bar(mpm.LinearElastic):
-    """P = E (F - 1) along each axis: waves of any height keep their shape."""
+    """P = E (F - 1) along each axis: waves of any amplitude keep their shape."""
 
     @staticmethod
     def energy(F, bulk, shear):
@@ -38,7 +38,7 @@ class Bar(mpm.LinearElastic):
 
 
 def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times, s, displacements of the tip, m, and the frequency, Hz, of a beam that is struck."""
+    """Return times, s, displacements of the tip, m, and the frequency, Hz, of a beam after an impulse."""
     grid = mpm.Grid([0, 0], [LENGTH + 3 * h, DEPTH + 4 * h], [round(LENGTH / h) + 3, round(DEPTH / h) + 4])
     beam, axis = mpm.box(grid, [0, 2 * h], [LENGTH, DEPTH + 2 * h]), ("along", "across").index(way)
 
@@ -59,7 +59,7 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Let the bar fly; return t, in periods, how its end swings, and its energy over the first, at output times."""
+    """Move the free bar; return times in periods, the oscillation of its end, m, and energy over the initial one."""
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
     low, speed = 2.3 * h, 2.5 / (2 * periods)  # over 2.5 lengths
@@ -80,7 +80,7 @@ def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def own_loss(t: np.ndarray, steps: int) -> np.ndarray:
-    """Return the energy that SDIRK2 leaves after t periods with a number of steps each."""
+    """Return the energy ratio that SDIRK2 retains after t periods, with a number of steps in each."""
     y = (GAMMA * 2 * np.pi / steps) ** 2
     return (1 - (y / (1 + y)) ** 2) ** (t * steps)
 
@@ -115,7 +115,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, beams: dict, bar: dict[str, np.ndarray], own: np.ndarray) -> None:
-    """Draw the tip of the beam, the end of the bar and its energy, with exact ones."""
+    """Draw the tip of the beam, the end of the bar and its energy, with the exact curves."""
     fig, ((tip, end, left),) = common.figure(1, 3, (14, 4.2))
     for k, h in enumerate(o.h):
         t, u, f = beams["across", h]

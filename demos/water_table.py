@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Water tables with suction: one rises under rain (Vauclin), the other is that of a levee in a flood.
+"""Water tables in unsaturated soil: one rises under rain (Vauclin), the other is in a levee during a flood.
 
 A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of it is computed.  Rain
 falls on its middle metre for eight hours.  Water spreads above the table, through unsaturated soil.  The reference is
@@ -7,10 +7,11 @@ a converged solution of finite volumes, with cells of 1.25 cm.  Source: Vauclin,
 laws. Soil above the level of the ditch is a seepage face without outflow.
 
 The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  A flood rises by 2.5 m in two days, stays
-for two days and falls in two days.  Its soil drains under suction, so late infiltration leaves late.
+for two days and falls in two days.  The soil of the levee retains water under suction, so water that infiltrates late
+also drains late.
 
-Errors: the largest of the height of the table, m, at six positions after 2, 3, 4 and 8 hours; of the outflow into the
-ditch at the end.  `balance`: error of the water balance of the slab, over the rain.  On one process.
+Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours, and the error
+of the final outflow into the ditch.  `balance`: error of the water balance of the slab, over the rain.  On one process.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ CONVERGED = {
     4: (1.1005, 1.0426, 0.9378, 0.8528, 0.7834, 0.7210),
     8: (1.2187, 1.1601, 1.0531, 0.9557, 0.8642, 0.7720),
 }
-"""By hours: heights of the table at the places, m."""
+"""By hour: heights of the water table at the positions, m."""
 FLOW = 653.1e-4 / HOUR  # m²/s into the ditch after 8 hours
 LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, run over rise, m
 SEEN = (2.0, 4.0, 6.0, 8.0)  # days
@@ -53,7 +54,7 @@ class Sand:
 
 
 def slab(h: float) -> mpm.Simulation:
-    """Return half of the slab at rest, of cells of h, m."""
+    """Return half of the slab at rest, on cells of size h, m."""
     grid = mpm.Grid([0, 0], [WIDTH, HEIGHT + 2 * h], [round(WIDTH / h), round(HEIGHT / h) + 2])
     soil = mpm.LinearElastic(bulk=1e10, shear=5e9, porosity=0.3, conductivity=0.35 / HOUR, retention=Sand())
     beside = ((WIDTH - 0.1, -1), (WIDTH + 0.1, DITCH))
@@ -74,7 +75,7 @@ def slab(h: float) -> mpm.Simulation:
 
 
 def tables(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return places and heights, m, of the water table in the columns of cells."""
+    """Return positions and heights, m, of the water table in the columns of cells."""
     cell = s.cells()
     columns = np.unique(np.round(cell.x[:, 0], 6))
     heights = []
@@ -91,7 +92,7 @@ def level(t: float) -> float:
 
 
 def levee(h: float) -> mpm.Simulation:
-    """Return the levee, its pores at rest with a table at its foot, of cells of h, m."""
+    """Return the levee on cells of size h, m, with water at rest and the water table at its base."""
     base = CREST + 2 * SLOPE * LEVEE
     grid = mpm.Grid([0, 0], [base, LEVEE + 2 * h], [round(base / h), round(LEVEE / h) + 2])
     corners = [(0, 0), (base, 0), (base - SLOPE * LEVEE, LEVEE), (SLOPE * LEVEE, LEVEE)]
@@ -145,7 +146,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, frames: list) -> None:
-    """Draw the tables of the slab with converged ones, and pressures in the levee."""
+    """Draw the water tables of the slab, with the converged ones, and pressures in the levee."""
     fig, axes = common.figure(1 + len(frames), 1, (8, 10))
     first, *others = np.ravel(axes)
     for i, (hours, x, z) in enumerate(curves):

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load on a dry column, 10 m high, on a rigid base, which reflects the wave, and on an absorbing base.  The
-   base carries nothing until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing one q.  Behind the
-   front particles move by q / (rho c).  Stresses oscillate behind a front, so their means are compared.
+1. A sudden load acts on a dry column, 10 m high, on a rigid base, which reflects the wave, or on an absorbing base.
+   The stress on the base is zero until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing one q.
+   Behind the front particles move by q / (rho c).  Stresses oscillate behind a front, so their means are compared.
 2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), slow or
-   fast. Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
-   water drains from 0.3 m below the top, little more than a cell, and its settlement is not judged.
+   fast.  Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
+   water drains from 0.3 m below the top, little more than a cell, and its settlement is not compared.
 3. The same column under a sudden load, with incompressible water and grains, k = 0.01 m/s, before a wave returns from
    its base (after de Boer, Ehlers and Liu 1993).  Its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2 a)
    ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
@@ -39,7 +39,7 @@ BOUNDS = {"stress": 0.02, "velocity": 0.02, "u": 0.01, "p": 0.006, "settlement":
 
 
 def column(cells: int, conditions: list, soil: mpm.Skeleton, length: float = LENGTH, **options) -> mpm.Simulation:
-    """Return a column, one cell wide, with a cell of the grid below its foot."""
+    """Return a column, one cell wide, with a cell of the grid below its base."""
     h = length / cells
     grid = mpm.Grid([0, 0], [h, length + 3 * h], [1, cells + 3])
     body = mpm.box(grid, [0, h], [h, length + h])
@@ -47,9 +47,9 @@ def column(cells: int, conditions: list, soil: mpm.Skeleton, length: float = LEN
 
 
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
-    """Return t, over L / c, stress on the base and velocity of the top, over exact scales, under a sudden load.
+    """Return t, over L / c, stress on the base and velocity of the top, over exact values, under a sudden load.
 
-    On a rigid base the stress is that of its reaction, on a quiet one that of the velocity there.
+    On a rigid base the stress is computed from the reaction, on an absorbing one from the velocity.
     """
     soil, h = SOIL(grain_density=GRAINS), LENGTH / cells
     c = np.sqrt(MODULUS / ((1 - POROSITY) * GRAINS))
@@ -97,7 +97,7 @@ def swinging(
 
 
 def hard_exact(t: np.ndarray) -> np.ndarray:
-    """Return the exact settlement, m, at times t, s, of the half-space of water and grains that are hard."""
+    """Return the exact settlement, m, at times t, s, of the half-space with incompressible water and grains."""
     young, n, k = HARD["young"], HARD["porosity"], HARD["conductivity"]
     M = young * 0.7 / 1.3 / 0.4
     a, b = (1 - n) * (HARD["grains"] - WATER) / M, 1e4 / (k * M)
@@ -107,7 +107,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
-    """Return times, s, settlements of the top, m, and exact ones, of a saturated column that is loaded all at once."""
+    """Return times, s, settlements of the top, m, and exact ones, of a saturated column under a sudden load."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,

@@ -60,14 +60,14 @@ def decades(low: int, high: int, step: int = 1) -> list[float]:
 
 @family(0.01)
 def conductivity():
-    """Beam that drains at its end, k = 1e-14 ... 1e2 m/s: tip, finite elements."""
+    """Beam that drains at its end, k = 1e-14 ... 1e2 m/s: tip against finite elements."""
     for k in decades(-14, 2):
         yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
 
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures, settlement, exact."""
+    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures; exact settlement."""
     water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
@@ -86,14 +86,14 @@ def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.01)
 def time_step_of_a_beam():
-    """Beam that drains at its end, dt = 1e-9 ... 1e9 s: tip, finite elements."""
+    """Beam that drains at its end, dt = 1e-9 ... 1e9 s: tip against finite elements."""
     for dt in decades(-9, 9, 3):
         yield f"dt = {dt:.0e} s", Beam(SOIL, WATER, end=8 * dt)
 
 
 @family(0.01)
 def fluid_bulk():
-    """Sealed column and beam, K_w = 1e4 Pa ... infinity: pressure and settlement, exact; tip, finite elements."""
+    """Sealed column and beam, K_w = 1e4 Pa ... infinity: exact pressure, settlement; tip against finite elements."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -107,7 +107,7 @@ def fluid_bulk():
 
 @family(0.02)
 def combined():
-    """Beam with k and dt of 1e-14 m/s, 1e-9 s or 1e2 m/s, 1e9 s, any K_w and nu: tip, finite elements of the limit."""
+    """Beam, k and dt of 1e-14 m/s, 1e-9 s or 1e2 m/s, 1e9 s, any K_w, nu: tip against finite elements of the limit."""
     for bulk in (1e4, 2.2e9, inf):
         for nu in (0.0, 0.499):
             sealed = Beam(soil(nu=nu, conductivity=0), mpm.Fluid(bulk), drained=())
@@ -123,7 +123,7 @@ def beside(beam: Beam, limit: Beam) -> Scene:
 
 @family(0.02)
 def poisson():
-    """Beam without and with water, nu = 0 ... 0.499: tip, finite elements."""
+    """Beam without and with water, nu = 0 ... 0.499: tip against finite elements."""
     for nu in (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.499):
         truth = (80, 32) if nu > 0.45 else (40, 16)
         yield f"drained, nu = {nu}", Beam(soil(nu=nu), truth=truth)
@@ -132,7 +132,7 @@ def poisson():
 
 @family(0.01)
 def steps():
-    """Beam loaded in 1 to 640 steps, drained and undrained: tip, finite elements."""
+    """Beam loaded in 1 to 640 steps, drained and undrained: tip against finite elements."""
     for n in (1, 2, 5, 10, 20, 40, 80, 160, 320, 640):
         yield f"drained, {n} steps", Beam(SOIL, steps=n, ramp=1.0)
         if n <= 160:
@@ -145,7 +145,7 @@ DROP = 1e-2  # Pa: so little that no layer leaves its place
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, k differs by 1e-8 ... 1e8: pressures over their difference, exact."""
+    """Steady flow through two layers, ratio of k 1e-8 ... 1e8: pressures over their difference, exact."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -164,7 +164,7 @@ def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def contrast_of_stiffness():
-    """Two layers under a load, E differs by 1e-6 ... 1e6, and under tiny loads: settlement, exact."""
+    """Two layers under a load, ratio of E 1e-6 ... 1e6, also under tiny loads: exact settlement."""
     for name, cut in CUTS.items():
         for ratio in decades(-6, 6, 1 if cut == 0.5 else 2):
             for strain in (1e-2, 1e-6, 1e-10) if ratio in (1e-6, 1e6) else (1e-2,):
@@ -177,7 +177,7 @@ def contrast_of_stiffness():
 
 @family(0.01)
 def offset():
-    """Beam at 20 random places on the grid, its end within a cell, too: tip, finite elements."""
+    """Beam at 20 random positions on the grid, also with its end within a cell: tip against finite elements."""
     for i, (x, y) in enumerate(np.random.default_rng(0).random((20, 2))):
         place = {"offset": float(y), "h": (1 / (19 + float(x)), 0.05)}
         yield f"{i}: {x:.3f}, {y:.3f} of a cell", Beam(soil(conductivity=1e-5), WATER, **place)
@@ -185,7 +185,7 @@ def offset():
 
 @family(0.02)
 def rotation():
-    """Square turned by 0 ... 90 degrees, under pressure: volume, pressure, exact; mean pressure, a finer grid."""
+    """Square rotated by 0 ... 90 degrees under load: exact volume, pressure; mean pressure against a finer grid."""
     K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
     J = stretch(1e5 / (2 * K)) ** 2
     a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
@@ -207,27 +207,27 @@ def held(s: mpm.Simulation) -> float:
 
 @cache
 def half_drained() -> float:
-    """Return the mean pressure at the end on a fine grid that the square fits."""
+    """Return the final mean pressure on a fine grid whose lines coincide with the sides of the square."""
     scene = square(0, None, **{**DRAINING, "cells": 48})()
     scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
     return held(scene.simulation)
 
 
 def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the error of the mean pressure over that at the start."""
+    """Return the error of the mean pressure, relative to the initial pressure."""
     return off(held(s), half_drained(), 1e5)
 
 
 @family(0.02)
 def rotation_of_a_beam():
-    """Beam rotated by 5 ... 90 degrees, with prescribed displacements at its end: tip, finite elements."""
+    """Beam rotated by 5 ... 90 degrees, with prescribed displacements at its end: tip against finite elements."""
     for angle in (5, 15, 30, 45, 60, 75, 90):
         yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
 
 
 @family(0.01)
 def points_per_cell():
-    """Beam of 1 ... 5 points per cell and direction: tip, finite elements."""
+    """Beam with 1 ... 5 points per cell and direction: tip against finite elements."""
     for n in range(1, 6):
         for y in (0.0, 0.3):
             many = {"per_cell": n, "offset": y, "h": (0.025, 0.025)}
@@ -236,7 +236,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Beam and column that stick 1e-10 ... 0.5 of a cell into the next: tip, finite elements; settlement, exact."""
+    """Beam and column whose last cell is filled to 1e-10 ... 0.5: tip against finite elements, exact settlement."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -245,7 +245,7 @@ def filling():
 
 @family(0.01)
 def few_points():
-    """Columns of one cell or less, of one point: settlement, exact."""
+    """Columns of one cell or less, or of one point: exact settlement."""
     for name, h, n in (("1 cell, 1 point", 1, 1), ("1 cell, 2 x 2 points", 1, 2), ("0.1 of a cell, 1 point", 10, 1)):
         yield name, column(settled(stretch(0.1) - 1), (SOIL, 1.0), h=h, per_cell=n, load=0.1 * M)
 
@@ -254,7 +254,7 @@ def few_points():
 def thin():
     """Beam of half a cell, one cell, two cells: error of the tip over that of Q1 elements on as many cells.
 
-    Of half a cell with two points or more over its height: one point creeps, and is warned of.
+    The beam of half a cell has at least two points over its height: with one point it creeps, and a warning says so.
     """
     for height, h, cells in ((0.05, 0.1, (10, 1)), (0.1, 0.1, (10, 1)), (0.1, 0.05, (20, 2))):
         for n in (3, 4) if height < h else (2, 3):
@@ -264,7 +264,7 @@ def thin():
 
 
 def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
-    """Return the beam's scene with its error measured by that of Q1 elements."""
+    """Return the beam's scene with its error relative to that of Q1 elements."""
     scene = beam()
     bound = off(beam.elements("q1-dg0", cells), beam.elements())
     return replace(scene, error=lambda s, r: off(tip(r), beam.elements()) / bound)
@@ -272,7 +272,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Column under its weight, rho g H / M = 1e-6 ... 10, and wet: height, exact; beam: tip, finite elements."""
+    """Column under its weight, rho g H / M = 1e-6 ... 10, and wet: exact height; beam: tip against finite elements."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio
@@ -288,7 +288,7 @@ def weight():
 
 @family(0.01)
 def suction():
-    """Column with an outer pressure p, -10 ... 0.5 M: settlement, exact; refused where pores close or it bursts."""
+    """Column with an outer pressure p, -10 ... 0.5 M: exact settlement; refused if its pores close or it bursts."""
     for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
         a = stretch(-ratio) if ratio < exp(-1) else nan
 
@@ -305,7 +305,7 @@ def suction():
 
 @family(0.02)
 def buckling():
-    """Slender cantilever under 0.5 ... 2 times its buckling load: tip, finite elements in 40 steps."""
+    """Slender cantilever under 0.5 ... 2 times its buckling load: tip against finite elements in 40 steps."""
     # under more it curls back behind its clamp, where the grid ends
     critical = np.pi**2 * M * 0.1**2 / 12 / 4
     slender = Beam(load=200.0, size=(1.0, 0.1), truth=(40, 4), truth_steps=40, h=(0.0125, 0.0125), ramp=1.0)
@@ -315,7 +315,7 @@ def buckling():
 
 @family(0.01)
 def overload():
-    """All in one step: column pressed by up to 100 M or pulled: settlement, exact; refused where there is none."""
+    """Column compressed by up to 100 M or in tension, in one step: exact settlement; refused without equilibrium."""
     for law in (mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic):
         for ratio in (0.1, 1, 10, 100, -0.1, -0.3, -0.4, -1):
             error = pressed(soil(law=law), ratio * M)
@@ -338,7 +338,7 @@ def pressed(material, load: float) -> Error | None:
 
 @family(0.01)
 def units():
-    """Beam of 1e-6 ... 1e6 m, of E = 1 ... 1e15 Pa: tip, finite elements of 1 m and 10 MPa."""
+    """Beam of 1e-6 ... 1e6 m, E = 1 ... 1e15 Pa: tip against finite elements of 1 m and 10 MPa."""
     exact = Beam().elements()
     for x in decades(-6, 6, 3):
         beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))
@@ -374,14 +374,14 @@ def rained(k: float, steep: float) -> Scene:
 
 @family(1e-4)
 def evaporation():
-    """Column above a water table in air of -1.5 m, k = 1e-12 ... 1 m/s, alpha h = 1e-3 ... 1e2: heads, exact."""
+    """Column above a water table in air of -1.5 m, k = 1e-12 ... 1 m/s, alpha h = 1e-3 ... 1e2: exact heads."""
     for k in decades(-12, 0, 4):
         for steep in decades(-3, 2):
             yield f"k = {k:.0e} m/s, alpha h = {steep:.0e}", partial(dried, k, steep)
 
 
 def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
-    """Return the column from water at rest on, with more sun than it has water for."""
+    """Return the column, with water at rest at first; the evaporation exceeds the supply of water."""
     alpha = 10 * steep
 
     def exact(z: np.ndarray) -> np.ndarray:
@@ -394,8 +394,10 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 
 @family(1e-4)
 def layered_rain():
-    """Two layers, off the grid lines, in rain, k differs by 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: heads, exact; also in
-    axisymmetry and 3D."""
+    """Two layers, off the grid lines, in rain, ratio of k 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: exact heads.
+
+    Also in axisymmetry and 3D.
+    """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):
             for other in (0.1, 10.0):
@@ -406,7 +408,7 @@ def layered_rain():
 
 
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
-    """Return a column of two layers; ratio, other: conductivity and steepness of the upper over the lower one's."""
+    """Return a column of two layers; ratio, other: k and alpha of the upper layer, relative to the lower layer."""
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2
 
@@ -432,10 +434,10 @@ def exponential(
     edge: float | None = None,
     kind: str = "plane",
 ) -> Scene:
-    """Return a column of 1 m and ten cells over a water table, of one or two exponential soils; its heads are exact.
+    """Return a column of 1 m and ten cells over a water table, of one or two exponential soils, with exact heads.
 
-    k, alpha: conductivities, m/s, and how steeply they fall with the head, 1/m; exact, start: heads, m, by heights, m;
-    edge: from where the second soil lies, m; kind: of the grid.
+    k, alpha: conductivities, m/s, and their rates of decrease with the head, 1/m; exact, start: heads, m, by heights,
+    m; edge: lower end of the second soil, m; kind: of the grid.
     """
     h, weight, d = 0.1, 9810.0, 3 if kind == "3D" else 2
     grid = mpm.Grid([0] * d, [h] * (d - 1) + [1 + 2 * h], [1] * (d - 1) + [12], axisymmetric=kind == "axisymmetric")
@@ -471,7 +473,7 @@ def exponential(
 
 @family(1e-3)
 def ponding():
-    """Column of van Genuchten's soil, n = 1.2 ... 7, that is ponded at heads of -1 ... -100 m: steady heads, exact."""
+    """Column of van Genuchten's soil, n = 1.2 ... 7, ponded from initial heads of -1 ... -100 m: exact steady heads."""
     for n in (1.2, 2.0, 7.0):
         for head in (-1.0, -10.0, -100.0):
             for alpha in (0.5, 15.0):
@@ -479,7 +481,7 @@ def ponding():
 
 
 def ponded(n: float, head: float, alpha: float) -> Scene:
-    """Return a column whose pores all fill, and drain at its base."""
+    """Return a column that becomes saturated, and drains at its base."""
     law = mpm.VanGenuchten(9810.0 / alpha, residual=0.1, n=n, air_entry=100.0)
     soil = mpm.LinearElastic(1e9, 5e8, porosity=0.4, conductivity=1e-5, retention=law)
     grid = mpm.Grid([0, 0], [0.1, 1.2], [1, 12])

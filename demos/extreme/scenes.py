@@ -65,7 +65,7 @@ def turned(x: np.ndarray, angle: float) -> np.ndarray:
 
 
 def place(s: mpm.Simulation, corners: np.ndarray) -> None:
-    """Put the undeformed body elsewhere, turned: the corners (n, 4, 2) of its points' domains."""
+    """Move and rotate the undeformed body to new corners (n, 4, 2) of its domains."""
     corners = corners - s.grid.base
     points = replace(s.state.points, corners=corners, origin=corners, x=corners.mean(axis=1))
     s.state = replace(s.state, points=points)
@@ -124,7 +124,7 @@ class Beam:
         return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
 
     def elements(self, element: str = "taylor-hood", cells: tuple[int, int] | None = None) -> np.ndarray:
-        """Return the displacement (2,) of the tip by finite elements, which do not see the grid."""
+        """Return the displacement (2,) of the tip by finite elements, which are independent of the grid."""
         steps = self.steps if self.fluid and self.drained else self.truth_steps
         seen = replace(self, steps=steps, h=(1, 1), offset=0, per_cell=0, angle=0, truth=cells or self.truth)
         return finite_elements(seen, element)
