@@ -242,7 +242,7 @@ def test_what_is_no_quiet_side_is_refused(conditions, options, names):
 
 def test_a_side_of_moving_bodies_does_not_become_quiet():
     s = column(4, [mpm.Displacement("bottom", (0, 0))])
-    with pytest.raises(ValueError, match="inertia before"):
+    with pytest.raises(ValueError, match="first stage in which"):
         s.stage(conditions=[mpm.Quiet("bottom")])
 
 
