@@ -167,8 +167,9 @@ class FreeTools(ContactProblem):
         motions = self._guides.transpose(2, 0, 1)
         columns = [self._onto(found, self._pulled(found, q)) for q in motions]
         onto = self._onto(found, found.touch.force)
-        sums = law.by_contact(np.stack([onto, np.abs(onto), *columns], axis=2).reshape(len(onto), -1))
-        sums = sums.reshape(len(motions[0]), len(motions), -1)
+        rows = np.stack([onto, np.abs(onto), *columns], axis=2)  # of no contact on some processes
+        sums = law.by_contact(rows.reshape(len(onto), int(np.prod(rows.shape[1:]))))
+        sums = sums.reshape(len(motions[0]), len(motions), 2 + len(columns))
         S = sums[:, :, 2:]
         if d == 2:  # the lever arm changes as the tool moves
             S[:, d, :d] += np.einsum("kij,ki->kj", self._guides[:, :d, :d], across(sums[:, :d, 0]))

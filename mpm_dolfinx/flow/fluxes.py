@@ -245,7 +245,7 @@ class CellContents(Keyed):
         """Volumes (m,) of the pieces, m^d; in axisymmetry, areas (m,) of their sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
-        sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), -1).T]))
+        sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
         """Volumes (n,) of material in the filled cells, m^d, and the fixed-stress coefficient times volume."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
