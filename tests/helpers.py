@@ -131,3 +131,26 @@ def refused_in_one_line(make, name, value, folder, longest):
     line = str(caught.value)
     assert "\n" not in line and len(line) < longest
     assert name in line and value in line and re.search(r"\bmust\b|\bneeds?\b", line), line
+
+
+def left_after_a_way_and_back(grid):
+    """Return the mean residual stress and largest pressure of a wet beam bent while its support moves and returns."""
+    hold = mpm.Displacement("left", lambda t: (np.sin(np.pi * t), 0.0))
+    load = mpm.Traction("right", lambda t: (0, -600 * np.sin(np.pi * t)))
+    body, soil = mpm.box(grid, [0.1, 0.5], [0.9, 0.8]), mpm.Hencky(1e6 / 3, 2e5, porosity=0.4, conductivity=1e-4)
+    s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={}, conditions=[hold, load])
+    result = s.run(1.0, 1 / 60, progress=False)
+    assert result.balance < 1e-8
+    return np.array([np.linalg.norm(s.effective_stress(), axis=(1, 2)).mean(), np.abs(s.points.pressure).max()])
+
+
+def gathered(simulation):
+    """Return positions, pressures, stresses and F of all points by number, and their counts a process; {} but on 0."""
+    points = simulation.points
+    columns = (points.id, points.x, points.pressure, simulation.effective_stress(), points.F)
+    parts = simulation.grid.comm.gather(columns)
+    if not parts:
+        return {}
+    ids, *rows = (np.concatenate(a) for a in zip(*parts, strict=True))
+    state = zip(("x", "p", "stress", "F"), (values[np.argsort(ids)] for values in rows), strict=True)
+    return {**dict(state), "counts": [len(part[0]) for part in parts]}

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -24,12 +25,5 @@ def pushed(load=None):
 if __name__ == "__main__":
     simulation = pushed()
     result = simulation.run(0.1, 0.025, progress=False)
-    points = simulation.points
-    columns = (points.id, points.x, points.pressure, simulation.effective_stress(), points.F)
-    parts = simulation.grid.comm.gather(columns)
-    if parts:
-        ids, *rows = (np.concatenate(a) for a in zip(*parts, strict=True))
-        order = np.argsort(ids)
-        state = {name: values[order] for name, values in zip(("x", "p", "stress", "F"), rows, strict=True)}
-        state["lines"] = np.concatenate(simulation.grid.lines)
-        np.savez(sys.argv[1], **state, balance=result.balance, counts=[len(part[0]) for part in parts])
+    if state := gathered(simulation):
+        np.savez(sys.argv[1], **state, balance=result.balance, lines=np.concatenate(simulation.grid.lines))

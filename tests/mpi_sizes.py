@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -17,11 +18,5 @@ acting = {"conditions": [push, mpm.Drained("right"), mpm.Drained("top", region=(
 walls = {"bottom": "xy", "left": "x"}
 simulation = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=walls, **acting)
 result = simulation.run(1.0, 0.25, progress=False)
-points = simulation.points
-columns = (points.id, points.x, points.pressure, simulation.effective_stress(), points.F)
-parts = simulation.grid.comm.gather(columns)
-if parts:
-    ids, *rows = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    state = {name: values[order] for name, values in zip(("x", "p", "stress", "F"), rows, strict=True)}
-    np.savez(sys.argv[1], **state, balance=result.balance, counts=[len(part[0]) for part in parts])
+if state := gathered(simulation):
+    np.savez(sys.argv[1], **state, balance=result.balance)

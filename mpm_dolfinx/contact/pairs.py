@@ -160,10 +160,14 @@ class FacePairs(Pairs):
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""
-        grid = self.grid
-        index = np.stack(np.unravel_index(self.other % grid.cells, tuple(grid.shape)), axis=1)
-        off = grid.in_cells(self.y) - index - 0.5
-        return self.other, np.prod(0.5 + off[:, None] * grid.signs, axis=2)
+        return self.other, shape_values_in(self.grid, self.other, self.y)
+
+
+def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process at positions x (m, d), m."""
+    index = np.stack(np.unravel_index(cells % grid.cells, tuple(grid.shape)), axis=1)
+    off = grid.in_cells(x) - index - 0.5
+    return np.prod(0.5 + off[:, None] * grid.signs, axis=2)
 
 
 def at_nodes(

@@ -22,7 +22,7 @@ from mpm_dolfinx.bodies.faces import Surface, interpolate
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Tied, holding
 from mpm_dolfinx.conditions.sides import gathered
-from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix
+from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix, shape_values_in
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
 
@@ -87,8 +87,7 @@ class Ties(Acting):
             gap = p.now(points) - p.origin(points) - interpolate(moved[tie.partner[p.face]], across)
             y = p.x + tie.way[p.face]
             inside = y - NEAR * np.sign(tie.way[p.face, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
-            index = np.floor(grid.in_cells(inside)).astype(np.int64)
-            other = np.ravel_multi_index(tuple(index.T), tuple(grid.shape)) + p.cell // grid.cells * grid.cells
+            other = grid.number(grid.index_from_base(inside)) + p.cell // grid.cells * grid.cells
             area = np.linalg.norm(p.area(points), axis=1)
             stiffness = HOLD * modulus[p.at] * area / grid.sizes_at(p.x).min(axis=-1)
             values = np.concatenate([np.stack([stiffness, other], axis=1), gap, y], axis=1)
@@ -118,9 +117,7 @@ class TieLoads(Loads):
     def __init__(self, grid: Grid, cell, x, other, y, stiffness: NDArray[np.float64], gap: NDArray[np.float64]):
         self._grid = grid
         self._cell, self._other = cell, other
-        index = np.stack(np.unravel_index(other % grid.cells, tuple(grid.shape)), axis=1)
-        beyond = np.prod(0.5 + (grid.in_cells(y) - index - 0.5)[:, None] * grid.signs, axis=2)
-        self._values = np.concatenate([grid.shape_values(cell, x), -beyond], axis=1)
+        self._values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
