@@ -7,15 +7,17 @@ release is no longer supported.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
+from time import perf_counter
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 import ufl
-from dolfinx import common, cpp, fem, la, mesh
+from dolfinx import cpp, fem, la, mesh
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base._compiler import compiler
@@ -123,13 +125,22 @@ def scatter_reverse_add(u: fem.Function) -> None:
     u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)
 
 
-def seconds(task: str) -> float:
-    """Return the wall time, s, that dolfinx's timers have recorded for a task."""
-    try:
-        total = common.timing(task)[1]
-    except RuntimeError:  # no such task so far
-        return 0.0
-    return total.total_seconds() if hasattr(total, "total_seconds") else total
+seconds: Counter[str] = Counter()
+"""Wall time, s, of each part of a run on this process, as `Timer` adds it up."""
+
+
+class Timer:
+    """Context that adds its wall time to a part's `seconds`; timers of dolfinx 0.9 count ticks of 10 ms."""
+
+    def __init__(self, part: str):
+        self._part = part
+        self._start = perf_counter()
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        seconds[self._part] += perf_counter() - self._start
 
 
 class CompiledForm:

@@ -21,7 +21,6 @@ from petsc4py import PETSc
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
@@ -427,7 +426,7 @@ class MomentumProblem:
         self._goes_on = goes_on
         self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
-        with Timer("mpm: loads"):
+        with _compat.Timer("loads"):
             external = forms.summed(1, [one.dead for one in loads])[system.touched]
             self._external = external if held is None else external + held[system.touched]
 

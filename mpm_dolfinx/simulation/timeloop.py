@@ -15,7 +15,6 @@ from typing import Any, Protocol
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx.common import Timer
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
@@ -50,7 +49,7 @@ PARTS = (
     "move points",
     "output",
 )
-"""Timed parts of a run, as `mpm: ...` in dolfinx's list of timings."""
+"""Timed parts of a run."""
 
 Observer = Callable[[Any], None]
 """A function of the simulation."""
@@ -174,7 +173,7 @@ def run(
     bar = _bar(start, last, times.end, progress and comm.rank == 0)
 
     def output(converged: bool) -> None:
-        with Timer("mpm: output"):
+        with _compat.Timer("output"):
             ended = replace(simulation.state.result, converged=converged)
             _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
@@ -300,16 +299,12 @@ class _Stopwatch:
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
-        self._timed = {part: seconds - result.profile.get(part, 0.0) for part, seconds in _timings().items()}
+        self._timed = {part: _compat.seconds[part] - result.profile.get(part, 0.0) for part in PARTS}
 
     def read(self, result: Result) -> Result:
         """Return the histories with the times so far."""
-        profile = {part: seconds - self._timed[part] for part, seconds in _timings().items()}
+        profile = {part: _compat.seconds[part] - self._timed[part] for part in PARTS}
         return replace(result, wall=time.perf_counter() - self._start, profile=profile)
-
-
-def _timings() -> dict[str, float]:
-    return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:

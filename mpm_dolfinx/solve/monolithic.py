@@ -32,9 +32,9 @@ from dataclasses import dataclass
 from petsc4py import PETSc
 
 import numpy as np
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.flow.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumSystem
 from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
@@ -196,7 +196,7 @@ class BlockSolver:
         most = self._plan.many if self._plan.fallback else MOST
         count = self._iterate(operator.inverses, scale, slopes, rtol, most)
         if self._plan.fallback and self._ksp.getConvergedReason() < 0:
-            with Timer("mpm: factorisation"):
+            with _compat.Timer("factorisation"):
                 factors = self._factorised()
             self._ksp.setInitialGuessNonzero(True)
             count += self._iterate(factors, scale, slopes, rtol, MOST)

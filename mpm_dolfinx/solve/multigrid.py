@@ -21,9 +21,9 @@ from petsc4py import PETSc
 
 import numpy as np
 import scipy.sparse
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.solve.petsc_options import set_defaults
 
@@ -80,7 +80,7 @@ def multigrid_solver(
     ksp.setType(PETSc.KSP.Type.GMRES)
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
     ksp.setOptionsPrefix(f"mpm_{name}_{'firmly' if firmly else 'multigrid'}_")  # separate from the options for factors
-    with Timer("mpm: factorisation"):
+    with _compat.Timer("factorisation"):
         steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest, lines)
     ksp.pc.setType(PETSc.PC.Type.MG)
     ksp.pc.setMGLevels(len(steps) + 1)

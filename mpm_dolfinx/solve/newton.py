@@ -27,9 +27,9 @@ from functools import cached_property
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged, Report
 from mpm_dolfinx.flow.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
@@ -335,7 +335,7 @@ class Newton:
                 why = "beta is below alpha^2 / (2 K_dr)" if self._scheme.of_fluid else "cut the step"
                 name = self._scheme.coupling
                 raise NotConverged(f"the {name} iteration diverges ({why})", report.history) from failed
-            with Timer("mpm: linear solve"):
+            with _compat.Timer("linear solve"):
                 dp = self._solvers.solve_storage()
             self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
@@ -350,7 +350,7 @@ class Newton:
         for count in range(MOMENTUM_STEPS):
             if count and errors.u.max() <= goal:
                 return
-            with Timer("mpm: linear solve"):
+            with _compat.Timer("linear solve"):
                 self._solvers.solve_momentum()
             before, errors = errors.u.max(), self._line_search(errors, True)
             settled = self._momentum.settle(errors.u.max() <= SETTLED)
@@ -371,7 +371,7 @@ class Newton:
         Round-off counts as 0. The noted residual includes it, with a scale of at least round-off over tolerance.
         """
         first = not self.report.history
-        with Timer("mpm: residual"):
+        with _compat.Timer("residual"):
             r, forces = self._momentum.residual_of_parts()
             forces = forces if start is None else np.maximum(start, forces)
             u, error_u = self._momentum.out_of_balance(r, forces, first)
@@ -422,7 +422,7 @@ class Newton:
             if self._storage is not None:
                 errors.fluid.vector.array_w[done[self._storage.system.of_parts.of]] = 0.0
         forces = np.maximum(errors.forces, self._momentum.system.round_off / self._scheme.tolerance)
-        with Timer("mpm: linear solve"):
+        with _compat.Timer("linear solve"):
             if errors.fluid is None:
                 return self._solvers.solve(self._kept, rtol, forces)
             least = errors.fluid.round_off / self._scheme.tolerance

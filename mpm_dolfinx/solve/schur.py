@@ -22,9 +22,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
@@ -194,14 +194,14 @@ class LinearSolvers:
             Added fraction of the elastic shear stiffness, one number or one for each part.
         """
         kept = kept or Kept()
-        with Timer("mpm: tangent"):
+        with _compat.Timer("tangent"):
             first = not self._momentum.K.assembled
             momentum.assemble_tangent(data, firmness)
             if first and not self.plan.symmetric and self.du.comm.size == 1:
                 renew(self._momentum.K)
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces, momentum.of_suction(data))
-        with Timer("mpm: factorisation"), using(self.scheme.petsc_options, self._unread):
+        with _compat.Timer("factorisation"), using(self.scheme.petsc_options, self._unread):
             if storage is None:
                 self.solve_u.setUp()
             elif self._block is not None:

@@ -11,9 +11,9 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
 from mpm_dolfinx.bodies.bodies import Body
@@ -120,7 +120,7 @@ class Motion:
         LeftGrid
             A point has left the grid.
         """
-        with Timer("mpm: move points"):
+        with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
@@ -379,7 +379,7 @@ class Motion:
         """Return a state whose points carry the pressures of their pieces: the next step resets the grid."""
         carried, points = state.pieces, state.points
         if self._storage is not None:
-            with Timer("mpm: remap"):
+            with _compat.Timer("remap"):
                 pieces = on_grid.cut.pieces
                 store = self._materials.storage(points) * points.volume0 * points.J
                 on_grid.set_pressures(carried.of_cell)

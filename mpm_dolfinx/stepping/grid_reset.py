@@ -13,9 +13,9 @@ from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
-from dolfinx.common import Timer
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
@@ -142,14 +142,14 @@ class OnGrid(Keyed):
         """Return the integration points with the present data of the points, which have hardly moved."""
         if not state.stay:
             return self.data
-        with Timer("mpm: integration data"):
+        with _compat.Timer("integration data"):
             return self._quadrature.data(self.cut, self._places, state.points)
 
     def start(self, state: State) -> None:
         """Set the pressures at the start of a step."""
         if self._storage is None:
             return
-        with Timer("mpm: remap"):
+        with _compat.Timer("remap"):
             p_n = self._storage.p_n.x
             p_n.array[self.contents.filled] = self.pressures(state)
             p_n.scatter_forward()
@@ -652,7 +652,7 @@ def assembled(
         return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
-    with Timer("mpm: integration data"):
+    with _compat.Timer("integration data"):
         pairs = on_grid.key if any(one.couples for one in loads) else None  # contact pairs depend on the positions
         others = pairs, on_grid.not_full if stage.inertia else None, () if grid.follow is None else grid.lines
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, *others), make, grid.comm)

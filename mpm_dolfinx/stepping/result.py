@@ -41,7 +41,7 @@ class Result:
     balance, residual
         Largest relative errors so far of the fluid balance, and of the two problems.
     wall, profile
-        Time, s, of the whole run, and of each part of it on this process, from dolfinx's timers.
+        Time, s, of the whole run, and of each part of it on this process.
     converged
         Whether the end has been reached.
     event

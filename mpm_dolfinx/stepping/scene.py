@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from dolfinx import fem
-from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.validation import line
@@ -219,10 +219,10 @@ class Scene:
 
         def make() -> OnGrid:
             self._assembled.clear()  # its coefficients change now
-            with Timer("mpm: cut domains"):
+            with _compat.Timer("cut domains"):
                 cut = CutDomains(grid, points, self.numerics.quadrature == "domain", self.momentum.inertia is not None)
                 self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
-            with Timer("mpm: integration data"):
+            with _compat.Timer("integration data"):
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
 
@@ -268,7 +268,7 @@ class Scene:
             return state.at_owners(self.grid), 0
 
         def make() -> tuple[dict[str, Any], int]:
-            with Timer("mpm: renew domains"):
+            with _compat.Timer("renew domains"):
                 new, count = self._renewal.renewed(state)
             return {name: getattr(new, name) for name in ("points", "pieces", "stay") if count}, count
 

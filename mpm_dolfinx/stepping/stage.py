@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
-from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.validation import all_of, check_names, given, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
@@ -133,7 +133,7 @@ class Stage:
 
     def placed(self, place: Place) -> list[Loads]:
         """Return the loads on the momentum in a substep."""
-        with Timer("mpm: loads"):
+        with _compat.Timer("loads"):
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
