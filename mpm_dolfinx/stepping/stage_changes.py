@@ -131,7 +131,7 @@ def begin_stage(
         points = replace(points, origin=points.corners)
     outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(begun, before) else None
-    new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest, "trend": None}
     return replace(state, points=points, pieces=pieces, **new)
 
 
