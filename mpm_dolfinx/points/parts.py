@@ -61,7 +61,7 @@ class OfParts:
         """Return the sums (..., count) of entries (..., n) over each part, of all processes."""
         order, start, present = self._sorted
         out = np.zeros((*values.shape[:-1], self.count))
-        out[..., present] = np.add.reduceat(values[..., order], start, axis=-1)
+        out[..., present] = np.add.reduceat(values.take(order, axis=-1), start, axis=-1)
         return over_all(self.comm, out)
 
     def norms(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
