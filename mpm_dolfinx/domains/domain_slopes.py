@@ -151,12 +151,10 @@ def linear_gradients(
     e = np.einsum("ijn,ajkn->aikn", cofactors / J, slope)
     ratio = np.trace(e, axis1=1, axis2=2)
     # the mean is weighted by volumes at rest; the second-order part would change the domain's volume, so it is removed
-    shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
-    for a, b in np.ndindex(d, d):
-        variance = sum_by(of, fraction * xi[a] * xi[b], len(F))
-        shift += variance * ratio[b] * slope[a]
-        second += 0.5 * variance * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
-    base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
+    variances = sum_by(of, np.array([[fraction * x * y for y in xi] for x in xi]), len(F))
+    weight, part = np.einsum("abn,bn->an", variances, ratio), np.einsum("abn,bjkn->ajkn", variances, e)
+    second = 0.5 * (np.einsum("an,aikn->ikn", weight, e) - np.einsum("aijn,ajkn->ikn", e, part))
+    base = base - np.einsum("ijn,jkn->ikn", base, second) + np.einsum("an,aijn->ijn", weight, slope)
     out = base.take(of, axis=2) + sum(x * slope[a].take(of, axis=2) for a, x in enumerate(xi))
     out = np.ascontiguousarray(out.transpose(2, 0, 1))
     ratios = determinant(out)
@@ -190,9 +188,8 @@ def _slopes(
             xi = np.einsum("abn,bn->an", inverse, neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d])
             xi[:, ~joined] = 0.0
             change = neighbours_columns[: k * k] - own[: k * k]
-            for a in range(d):
-                B[a] += xi[a] * change
-                A[a] += xi[a] * xi
+            B += xi[:, None] * change
+            A += xi[:, None] * xi
             some |= joined
         A[axis, axis, ~some] += 1.0  # without a neighbour on this axis the slope is zero
     return np.einsum("abn,bmn->amn", _inverse(A), B).reshape(d, k, k, len(rows)), inverse
