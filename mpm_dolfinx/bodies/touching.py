@@ -325,12 +325,7 @@ def uncovered(
     stop = np.flatnonzero(free & np.append(~free[1:], True)[: len(free)])
     order = np.lexsort((i[begin], j[stop], j[begin], owner[begin]))
     begin, stop = begin[order], stop[order]
-    same = [
-        owner[begin],
-        j[begin],
-        j[stop],
-        i[begin] - np.arange(len(begin)),
-    ]  # equal runs, adjacent along the first axis
+    same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # equal in adjacent runs
     first = np.append(True, np.any([np.diff(s) != 0 for s in same], axis=0))[: len(begin)]
     last = np.append(first[1:], True)[: len(begin)]
     stop = stop[last]
