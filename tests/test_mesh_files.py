@@ -295,7 +295,7 @@ def in_two_pieces(folder):
 
 
 BAD = {
-    "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces of 8 cells", "meshio reads 4"),
+    "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces with 8 cells", "meshio reads 4"),
     "a system of Nastran": (
         lambda f: written(f, BULK.replace("SYSTEM", "5"), "mesh.bdf"), "mesh: GRID in the coordinate system", "5"),
     "a file of no nodes": (lambda f: written(f, "*HEADING\n"), "mesh: has no vertices", "must have cells"),

@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass
 class Report:
-    """Report of a converged time step.  Pressures are those of cells; see `motion_error` for the motion."""
+    """Report of a converged time step.  Pressures are cell pressures; see `motion_error` for the motion."""
 
     newton: int = 0  # Newton iterations
     coupling: int = 0  # iterations of the coupled linear solver

@@ -48,8 +48,8 @@ def in_step(
     end.  If u is prescribed in both substeps, velocities are first-order accurate and accelerations do not converge.
     Here v is the velocity of the parabola through the three displacements.
 
-    `share` is the end of the substep as a fraction of the step.  `start`, `now` and `end` are the displacements at the
-    start of the step, at the end of the substep and at the end of the step.
+    `share` is the end of the substep as a fraction of the step.  The displacements are `start` at the
+    start of the step, `now` at the end of the substep and `end` at the end of the step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 

@@ -138,7 +138,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside of parts, then those of all instances, or of all parts if no instance exists."""
+    """Return the definitions outside of parts, then of all instances, or of all parts if no instance exists."""
     whole = _Scope()
     scope = whole
     parts = {}

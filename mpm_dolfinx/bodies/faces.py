@@ -124,7 +124,7 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 def surface(
     bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the free faces on a side of the active bodies: those without contact to other bodies.
+    """Return the faces on a side of the active bodies, without the parts that touch other bodies.
 
     Contact is determined for the seeded bodies, after their maps.  It is permanent, because bodies in contact stick.
 

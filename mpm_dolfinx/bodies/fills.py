@@ -49,7 +49,7 @@ class Contact:
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Return which corners (n, 4) of the fill's faces lie on the paired face, and that face's displacement there.
 
-        The displacements (n, 4, d), m, are those at the corners.
+        The displacements have the shape (n, 4, d) and the unit m.
         """
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
@@ -77,7 +77,7 @@ def put(
 
     Sides of the fill that touch a neighbour as seeded follow the neighbour's displacement.  The side opposite to the
     largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero velocity;
-    the volumes of its domains are those of the displaced shape.
+    its domains have the volumes of the displaced shape.
 
     Parameters
     ----------

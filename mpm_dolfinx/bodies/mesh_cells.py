@@ -57,7 +57,7 @@ def edges(kind: str) -> list[tuple[int, int]]:
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first index of each distinct row of an array (n, k), and the index of the distinct row (n,).
 
-    Distinct rows are sorted.  `numpy.unique` compares rows as objects and takes five times as long.
+    Distinct rows are sorted.  `np.unique` compares rows as objects and takes five times as long.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]

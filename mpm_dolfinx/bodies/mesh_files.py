@@ -62,8 +62,8 @@ def from_mesh(
         2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
         warning that gives the distance of edge nodes from straight edges.  2D cells must lie in a plane of equal z.
     part
-        Name of a group of cells, such as a physical group, an Abaqus part, instance or set, or a number in data such as
-        "MaterialIDs".  By default all cells.
+        Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a number in data
+        such as "MaterialIDs".
     cell_tags, facet_tags
         Tags of a dolfinx mesh.  For a file: `cell_tags` is the name of the cell data that number parts and sides.
     names

@@ -169,7 +169,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facet that contains each face, and their cells.
 
-    Nodes of a facet ascend; those of a triangle follow a -1.  A face inside a cell has only -1.
+    Nodes of a facet ascend; a -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
     """
     d = mesh.x.shape[1]
     start = 0

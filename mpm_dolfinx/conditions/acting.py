@@ -127,7 +127,7 @@ class At(NamedTuple):
 class Loads:
     """Forces and tangents of the conditions of one kind in a substep.  A method that is not overridden adds nothing.
 
-    Arrays b are local, unrolled nodal forces, N.  Entries at ghost nodes are added to those of their owners.
+    Arrays b are local, unrolled nodal forces, N.  Entries at ghost nodes are added at their owners.
     """
 
     linear: bool = True
@@ -266,7 +266,7 @@ class Loads:
         """Return the corners (n, 2^d, d), m, moved out of forbidden regions.
 
         `free` (n, 2^d, d) are the components that no other condition prescribes.  By default only small penetrations
-        are corrected, with `everywhere` those of any depth.
+        are corrected; with `everywhere`, penetrations of any depth.
         """
         return corners
 

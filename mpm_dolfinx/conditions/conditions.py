@@ -4,9 +4,9 @@
 Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y),
 as before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes faces that
 touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).  Reference areas
-are those of the seeded shape, after the maps.
+refer to the seeded shape, after the maps.
 
-A new kind of condition is a class like those below, in a separate file.  Its method `acting` adds terms to the momentum
+A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
 balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
 Values may be functions of time t, reference positions X and current positions x.  The parameter names decide; see
@@ -198,7 +198,7 @@ class Source:
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return the user's terms of the momentum balance, and those of the fluid balance."""
+    """Return the user's terms of the momentum balance, and the terms of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -428,7 +428,7 @@ class Displacement(Condition):
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
         Displacement since the start, or since a stage reset it, at reference positions X (m, d).  For a mapped body,
-        the map converts X to seeded positions.  All d components are given, also those that are not prescribed.
+        the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid tools and contact groups as loads on the momentum, see `Acting`."""
+"""Rigid tools and contact groups as loads in the momentum balance, see `Acting`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Touching(Acting):
-    """Contact conditions of a stage: tools or groups.
+    """Contact conditions of one kind in a stage: either tools, or contacts between groups.
 
     Parameters
     ----------
     setting, names, found
-        Setting of the stage, names of the conditions, and the finder of contact pairs.
+        Data of the stage, names of the conditions, and the object that finds the contact pairs.
     """
 
     linear = False
@@ -39,15 +39,15 @@ class Touching(Acting):
         self.symmetric = found.symmetric
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the initial history of n points for each condition: pressures and shear tractions."""
+        """Return the initial contact history of n points for each condition: pressures and shear tractions."""
         return self.found.kept(n)
 
     def by_name(self, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Return rows (conditions, ...) by the names of the conditions."""
+        """Return the rows of an array (conditions, ...) by the names of the conditions."""
         return dict(zip(self.names, rows, strict=True))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments, filled with this value."""
+        """Return forces and moments on the bodies, all filled with this value."""
         return {"tool_forces": self.by_name(np.full((len(self.names), 3 if self._grid.dim == 2 else 6), value))}
 
 
@@ -57,7 +57,7 @@ class ToolsOfStage(Touching):
     Parameters
     ----------
     setting, tools
-        Setting of the stage, and its tools by name.
+        Data of the stage, and the tools by name.
     """
 
     conditions, title = (Tool,), "tools"
@@ -69,7 +69,7 @@ class ToolsOfStage(Touching):
         self.outside = found.faces
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments, filled with this value, zero displacements by loads, and initial velocities."""
+        """Return forces and moments filled with this value, displacements by loads of zero, and initial velocities."""
         out, d = super().unknown(value), self._grid.dim
         tools = dict(zip(self.names, self.found.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -82,13 +82,13 @@ class ToolsOfStage(Touching):
         return out
 
     def _ways(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements by loads before a step (tools,), m; with free tools (tools, q), and rotations."""
+        """Return displacements by loads (tools,), m, before a step; with free tools (tools, q), with rotations, rad."""
         if self.found.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
 
     def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return displacements and rotations, or velocities, (tools, q), zero for tools that are not free."""
+        """Return the displacements and rotations (tools, q), or the velocities; zero for tools that are not free."""
         d = self._grid.dim
         out = np.zeros((len(self.names), ways_of(d)))
         for row, name in zip(out, self.names, strict=True):
@@ -97,7 +97,7 @@ class ToolsOfStage(Touching):
         return out
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact with the tools in a substep."""
+        """Return the loads by contact with tools in a substep."""
         ways = self._ways(place)
         tools = self.found.going(Ways(place.start, place.t, ways, ways), place.start + place.dt * place.inertia)
         placed = tools, place.cut, place.points, ways, (place.start, place.t)
@@ -108,18 +108,18 @@ class ToolsOfStage(Touching):
         return FreeToolLoads(*placed, mass=self.found.masses, guides=self.found.guides, **options)
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if tools begin inside bodies."""
+        """Raise an error if a tool is inside a body at the start."""
         ways = self._ways(place)
         self.found.going(Ways(place.start, place.start, ways, ways)).check_start(place.cut, place.points, place.start)
 
 
 class ContactsOfStage(Touching):
-    """The contacts of groups in a stage.
+    """The contacts between groups in a stage.
 
     Parameters
     ----------
     setting, contacts
-        Setting of the stage, and its contacts by name.
+        Data of the stage, and the contacts by name.
     """
 
     conditions, title = (Contact,), "contacts"
@@ -129,7 +129,7 @@ class ContactsOfStage(Touching):
         super().__init__(setting, tuple(contacts), found)
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact between groups in a substep."""
+        """Return the loads by contact between groups in a substep."""
         return ContactLoads(self.found, place.cut, place.points)
 
     def check_start(self, place: Place) -> None:
@@ -138,14 +138,14 @@ class ContactsOfStage(Touching):
 
 
 class ToolLoads(ContactProblem):
-    """Contact with tools.
+    """Loads by contact with tools in a substep.
 
     Parameters
     ----------
     tools, cut
         Tools with their motion in the step, and cut particle domains.
     before, times
-        Displacements by loads before the step (tools,), m; start and end time, s.
+        Displacements caused by loads before the step (tools,), m.  Start of the step and end of the substep, s.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class ToolLoads(ContactProblem):
         return Gone(self.shares.own, self.pairs.poses)
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """See `ContactProblem`: by the time integration, from the positions of the tools in both substeps."""
+        """See `ContactProblem`.  The time integration finds the velocity from tool positions in both substeps."""
         pairs = self.pairs
         gone = pairs.carried - pairs.now
         if self._gone is not None:
@@ -182,7 +182,7 @@ class ToolLoads(ContactProblem):
         return gone / self.shares.own
 
     def ended(self, at: At) -> Loads:
-        """Return the contact with the tools at their final positions."""
+        """Return the loads by contact with the tools at their final positions."""
         out = copy(self)
         out._tools = self._tools.going(Ways(*self._times, self._before, self._before + self.found(at).travel))
         return out
@@ -194,26 +194,26 @@ class ToolLoads(ContactProblem):
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return corners without penetration of tools."""
+        """Return the corners, moved out of the tools that they slightly penetrate."""
         return self._tools.outside(corners, self._times[1], free, np.inf if everywhere else NEAR)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if tools have passed through bodies, or lie inside them."""
+        """Raise an error if a tool has passed through a body, or lies inside one."""
         start, t = self._times
         self._tools.check_end(self._cut, points, t, before, start)
 
 
 class FreeToolLoads(FreeTools, ToolLoads):
-    """Contact with tools, some of them free."""
+    """Loads by contact with tools, among them free tools."""
 
 
 class ContactLoads(ContactProblem):
-    """Contact between groups; the pairs follow the bodies.
+    """Loads by contact between groups; the contact pairs follow the motion of the bodies.
 
     Parameters
     ----------
     contacts, cut, points
-        Contacts, cut particle domains, and present points.
+        Contacts, cut particle domains, and material points at the start of the step.
     """
 
     def __init__(self, contacts: Contacts, cut: CutDomains, points: MaterialPoints):
@@ -226,5 +226,5 @@ class ContactLoads(ContactProblem):
         return self._contacts.near(self._cut, points, corners)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if groups overlap."""
+        """Raise an error if groups overlap after the step."""
         self._contacts.check_end(self._cut, points, before)
