@@ -116,8 +116,9 @@ def cell_kind(msh: mesh.Mesh) -> str:
 
 def geometry_dofs(msh: mesh.Mesh) -> NDArray[np.int32]:
     """Return the geometry nodes (cells, n) of the cells, ghosts included."""
-    dofs = msh.geometry.dofmap
-    return dofs.array.reshape(len(dofs), -1) if OLD else np.asarray(dofs)
+    if OLD:
+        return msh.geometry.dofmap.array.reshape(len(msh.geometry.dofmap), -1)
+    return np.asarray(msh.geometry.dofmaps[0] if hasattr(msh.geometry, "dofmaps") else msh.geometry.dofmap)
 
 
 def scatter_reverse_add(u: fem.Function) -> None:

@@ -33,14 +33,6 @@ def shear_name(name: str) -> str:
     return f"{name}_shear"
 
 
-def kept(contacts: Mapping[str, Rough], n: int, dim: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Return zero contact histories of n points: pressures (n,) and, if a contact resists slip, tractions (n, d)."""
-    return {
-        name: {pressure_name(name): np.zeros(n), **({shear_name(name): np.zeros((n, dim))} if contact.grips else {})}
-        for name, contact in contacts.items()
-    }
-
-
 def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
     """Return the points without the fields with these names."""
     return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})

@@ -24,15 +24,15 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
+from mpm_dolfinx.conditions.acting import Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import resistance
-from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import FacePairs
+from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -72,22 +72,20 @@ class Pairs(NamedTuple):
     gap: NDArray[np.float64]  # distance along the normal at the point (m,), m
 
 
-class Contacts:
+class Contacts(Touching):
     """The contacts between groups in a stage.
 
     Parameters
     ----------
-    sides
-        Finder of the sides of the bodies.
-    materials
-        Materials of the scene.
-    contacts
-        Contacts by name.
+    setting, contacts
+        Data of the stage, and its contacts by name.
     """
 
-    def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Mapping[str, Contact]):
-        self.grid, self._materials = sides.grid, materials
-        self.names, self.contacts = tuple(contacts), tuple(contacts.values())
+    conditions, title = (Contact,), "contacts"
+
+    def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
+        super().__init__(setting, contacts)
+        sides, self.contacts = setting.sides, tuple(contacts.values())
         self._faces: list[tuple[Surface, Surface]] = []
         signs = []
         for contact in self.contacts:
@@ -101,27 +99,18 @@ class Contacts:
         self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
         self._reach: Latest[NDArray[np.int64]] = Latest()
 
-    @property
-    def symmetric(self) -> bool:
-        """Whether the tangent is symmetric."""
-        return not any(contact.grips for contact in self.contacts)
-
-    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the zero contact histories of n points."""
-        return kept(dict(zip(self.names, self.contacts, strict=True)), n, self.grid.dim)
-
-    def placed(self, cut: CutDomains, points: MaterialPoints) -> tuple[ContactLaw, Origin, Callable, Callable]:
-        """Return the arguments of `ContactProblem` for a step with `points` at the start."""
+    def placed(self, place: Place) -> Loads:
+        """Return the loads by contact between groups in a substep."""
+        cut, points = place.cut, place.points
         found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
         reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
-        begun = self._law(cut, points, found, cut.points, points, reach)
 
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             there = replace(points, corners=points.corners + moved)
             return self._law(cut, points, self._met_all(cut, there), there, there, reach)
 
-        return *begun, again, reach
+        return ContactLoads(self, cut, *self._law(cut, points, found, cut.points, points, reach), again, reach)
 
     def _law(
         self,
@@ -301,10 +290,10 @@ class Contacts:
         if message := self._too_deep(cut, points):
             raise NotConverged(message)
 
-    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Raise an error if groups overlap at the start of a stage, at time t (s)."""
-        if message := self._too_deep(cut, points):
-            raise ValueError(f"{message}, at the start t = {t:g} s, must touch or be apart")
+    def check_start(self, place: Place) -> None:
+        """Raise an error if groups overlap at the start of the stage."""
+        if message := self._too_deep(place.cut, place.points):
+            raise ValueError(f"{message}, at the start t = {place.start:g} s, must touch or be apart")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
         """Return a message with depth and position of an overlap of groups, or "" if none overlap."""
@@ -317,6 +306,30 @@ class Contacts:
                 where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
                 return f"{line(contact)}: bodies overlap by {-deepest / h:.3g} cells at {where}"
         return ""
+
+
+class ContactLoads(ContactProblem):
+    """Loads by contact between groups; the contact pairs follow the motion of the bodies.
+
+    Parameters
+    ----------
+    contacts, cut
+        Contacts, and cut particle domains.
+    law, origin, again, reach
+        See `ContactProblem`.
+    """
+
+    def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, reach):
+        super().__init__(law, origin, again=again, reach=reach)
+        self._contacts, self._cut = contacts, cut
+
+    def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
+        """Return which corners are near other groups."""
+        return self._contacts.near(self._cut, points, corners)
+
+    def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Raise an error if groups overlap after the step."""
+        self._contacts.check_end(self._cut, points, before)
 
 
 def _extent(bodies: Sequence[Body]) -> tuple:

@@ -17,7 +17,7 @@ Forces are therefore f + D e (load - e . f) / s; minus their derivative is D - (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
-from mpm_dolfinx.conditions.acting import At, Loads
-from mpm_dolfinx.contact.history import Origin
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
+from mpm_dolfinx.contact.history import Origin, Rough, pressure_name, shear_name
 from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
@@ -89,6 +89,36 @@ class Gone(NamedTuple):
     own: float
     poses: Any
     flight: Any = None
+
+
+class Touching(Acting):
+    """Contact conditions of one kind in a stage: either tools, or contacts between groups.
+
+    Parameters
+    ----------
+    setting, given
+        Data of the stage, and its tools or contacts by name.
+    """
+
+    linear = False
+
+    def __init__(self, setting: Setting, given: Mapping[str, Rough]):
+        self.grid, self._materials = setting.grid, setting.materials
+        self.names = tuple(given)
+        self._grips = [one.grips for one in given.values()]
+        self.symmetric = not any(self._grips)
+
+    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return zero histories of n points: pressures (n,), Pa, and, if a contact resists slip, tractions (n, d), Pa."""
+        out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
+        for name, grips in zip(self.names, self._grips, strict=True):
+            out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
+        return out
+
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return forces and moments on the bodies, all filled with this value."""
+        rows = np.full((len(self.names), 3 if self.grid.dim == 2 else 6), value)
+        return {"tool_forces": dict(zip(self.names, rows, strict=True))}
 
 
 class ContactProblem(Loads):

@@ -27,13 +27,13 @@ Event = Callable[[Any], float]
 
 
 class Simulated(Protocol):
-    """A `Simulation`, whose `state` is replaced."""
+    """A `Simulation`, whose `state` a run replaces."""
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and the report of the step."""
+        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
 
 
 class Step(NamedTuple):
