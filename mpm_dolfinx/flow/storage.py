@@ -329,7 +329,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of fluxes between cells, at p in unsaturated soil.  `force`: see `StorageForms.driven`."""
+        """Assemble the matrix of fluxes between cells, at p if unsaturated.  For `force` see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
