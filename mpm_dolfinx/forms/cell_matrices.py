@@ -261,7 +261,7 @@ class StackedElementMatrices:
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
     """Return batches of cells with similar numbers of points: cells (c,), points (c, most), padding (c, most).
 
-    Cells are indices into `Places.filled`.  `padding` is True for entries after the last point of a cell.
+    Cells are indices into `Places.filled`.  Padding is True for entries after the last point of a cell.
     """
     cells = places.cells
     filled = places.filled

@@ -216,7 +216,7 @@ class Grid:
         points (parameters t, x or both) returns the same number of lines, between the same sides.
     axisymmetric
         The first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes, forces
-        and outflows are those of the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is
+        and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is
         the axis, where radial displacements are zero.
 
     Raises
