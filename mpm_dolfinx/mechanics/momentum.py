@@ -151,7 +151,7 @@ class MomentumForms:
             values, known = values | local.values, values | local.known
         else:
             known = values
-        # derivatives with respect to F, contracted; those with respect to u compile twenty times as long in 3D
+        # derivatives with respect to F, contracted; derivatives with respect to u compile twenty times as long in 3D
         beside = Beside()
         if locks:
             ratio = ufl.det(points.increment(self.u))
@@ -472,7 +472,7 @@ class MomentumProblem:
         """Return the out-of-balance nodal forces at u, N, and the force scale (parts,), N, of each connected part."""
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
-        system.held.gather(b, system.held_residual)  # before the penalties: walls bear those of sides next to them
+        system.held.gather(b, system.held_residual)  # before the penalties, which walls bear for sides next to them
         if pulls := [one.pulls for one in self.loads if one.stiff]:
             # not in the scale: at the start of a step they far exceed the forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]

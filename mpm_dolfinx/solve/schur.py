@@ -189,7 +189,7 @@ class LinearSolvers:
         kept
             Data that the tangents of the step share.
         data
-            Integration points, by default those of the problems.
+            Integration points, by default the points of the problems.
         firmness
             Fraction of the elastic shear stiffness to be added, one number or one for each connected part.
         """
@@ -289,7 +289,7 @@ class LinearSolvers:
     ) -> None:
         """Solve iteratively for x with equal relative accuracy in all parts, which may have different scales.
 
-        measured: function that converts b to the vector of which the solver computes norms; None: b itself.
+        measured: function that converts b to the vector whose norm the solver computes; None: b itself.
         """
         if of.count <= 1:
             ksp.solve(b, x)

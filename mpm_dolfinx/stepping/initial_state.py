@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The initial state: given stresses and pore pressures, balanced with the loads.
+"""Initial state: given stresses and pore pressures, balanced with the loads.
 
-Given stresses and the scheme's error leave out-of-balance forces. Steps of the momentum balance at fixed pressures
-remove these forces. Their deformation adds to the elastic strain of the points, whose positions do not change.
+Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
+pressures remove these forces. Their deformation adds to the elastic strain of the points. Positions do not change.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Mixed iterations; the iteration ends after PATIENCE ones that do not reduce the residual by the factor LESS.
+"""Iterations that are mixed; iterations, PATIENCE, without reduction of the residual by the factor LESS to end.
 
-A wet bank, its law elastic or frictional, blocks on a rough base, a half held one: forces left 4e-5 to 3e-9 with 40 and
-16 and with 80 and 24, in as many iterations; with 40 and 8 up to 6e-3.
+Tests: a wet bank, elastic or frictional, blocks on a rough base, one of them half supported. With 40 and 16 and with 80
+and 24 the remaining forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Change of stress in the balance, over the largest given stress, from which a warning is given.
+"""Change of stress by balancing / largest given stress, above which a warning is given.
 
-Also the largest relative residual of the forces, due to the scheme's error.
+Also the largest relative residual of the forces, due to errors of the discretisation.
 """
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of pieces for a pressure field; cells have the field's values at their centroids."""
+    """Return the pressures of the pieces for a pressure field; cells have the field's values at their centroids."""
     on_grid = scene.on_grid(points)
     grid = scene.grid
     pressure = scene.initial.pressure
@@ -77,17 +77,17 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 
 
 def balanced(scene: Scene, state: State) -> State:
-    """Return a state with stresses in equilibrium with the loads at its time, at its pore pressures.
+    """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
-    A displacement w of the grid is balanced with the strains of the pieces; points keep the mean strain of their
+    A displacement w of the grid is balanced with the strains of the pieces. Points store the mean strain of their
     domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes: nodal forces hold the remainder, `State.held`. Support forces are evaluated at the
-    displacement w, `State.rest`: the sides keep their seeded positions, whatever is prescribed at the start.
+    strains cannot balance all nodes; nodal forces balance the remainder, `State.held`. Support forces are evaluated at
+    the displacement w, `State.rest`: sides keep their seeded positions for any prescribed displacement at the start.
 
     Raises
     ------
     ValueError
-        The laws admit no such equilibrium.
+        There is no equilibrium with these laws.
     """
     forms, materials = scene.momentum, scene.materials
     try:
@@ -136,9 +136,9 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes of the balance; refuse a large relative residual.
+    """Log the changes by balancing; raise ValueError for a large relative residual.
 
-    Contact (touches) is found in the first step only: a residual is then a warning.
+    With contact (touches), which is detected only in the first step, a large residual causes a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -155,13 +155,13 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a displacement of the nodes, m, a local array; it is zero outside the cells of supported sides."""
+    """Return a displacement w of the nodes, m, a local array, set to zero outside the cells of supported sides."""
     nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
     return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the balance of momentum at zero displacement and zero rates, for points strained by u."""
+    """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
@@ -170,7 +170,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
 
 
 def _as_reset(scene: Scene, start: Start) -> State:
-    """Return the state at the start, as after a reset of the grid without motion."""
+    """Return the state at the start, in the form after a reset of the grid without motion."""
     cut, pieces = start.on_grid.cut, None
     if scene.storage is not None:
         p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
@@ -180,7 +180,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration from earlier ones and their steps; local arrays, m."""
+    """Return the next displacement of a fixed-point iteration; seen: earlier displacements and steps, local arrays."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

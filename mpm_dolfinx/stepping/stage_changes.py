@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Transitions between stages: bodies are added and removed, conditions change, and point data are replaced."""
+"""Changes between stages: bodies are added and removed, conditions change, and point data are replaced."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from mpm_dolfinx.stepping.step import set_up
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene at rest, in its first stage, with given stresses that are not balanced yet."""
+    """Return the state of a scene in its first stage, with given stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, conditions, present, later)
@@ -76,7 +76,7 @@ def begin_stage(
     reset_displacement: bool,
     fields: Mapping[str, ArrayLike],
 ) -> State:
-    """Return the state at the beginning of a stage: see `Simulation.stage`; named: the new conditions."""
+    """Return the state at the beginning of a stage, see `Simulation.stage`; named: new conditions."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
@@ -101,7 +101,7 @@ def begin_stage(
     state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
     state = scene.followed(state)
-    if state.stays:  # points have the pressures of their cells
+    if state.stays:  # points have the pressures of their cells, not of their pieces
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
     own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
@@ -138,9 +138,9 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, begun: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return a state at rest, and tractions (m, d), Pa, on points (m,) of new quiet sides, by names of data.
+    """Return a state before the next step, and tractions on new quiet sides: points (m,) and (m, d), Pa, by data name.
 
-    They balance stresses, loads of the previous stage, and remaining supports. begun: the stage with the quiet sides.
+    The tractions balance stresses, loads of the previous stage, and remaining supports. begun: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -151,7 +151,7 @@ def _released(
     cut = start.on_grid.cut
 
     def beside(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return the components (nodes, d) along `axes` of nodes in cells with the faces `some`."""
+        """Return the components (nodes, d) along `axes` at nodes of cells that contain the faces `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
@@ -174,7 +174,7 @@ def _released(
 def _gripped(
     scene: Scene, begun: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return points with their data of conditions: initial values, or values of the same points `before`."""
+    """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
     kept = begun.kept(len(points))
     if taken := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{taken[0]!r}: points have data of this name, must be another name of a condition")
@@ -190,7 +190,7 @@ def _holds_as(begun: Stage, before: Stage) -> bool:
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return conditions with the scene's contacts, which stages cannot change."""
+    """Return the conditions with the scene's contacts, which stages cannot change."""
     there, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and given != there:
         raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
@@ -203,9 +203,9 @@ def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool],
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
-    """Warn of each water level, given or on a side, whose unit weight differs from the pore fluid's.
+    """Warn of each water level, given or on a side, if its unit weight differs from the pore fluid's.
 
-    In a dry scene warn of each level with the unit weight of water under another gravity.
+    In a dry scene warn of each level with the unit weight of water, if gravity has another magnitude.
     """
     gravity, fluid = begun.conditions["gravity"], scene.fluid
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
@@ -223,7 +223,7 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
-    """Warn of each unchanged condition that also acts on faces exposed by an excavation."""
+    """Warn of each unchanged condition that also acts on faces that an excavation has exposed."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in begun.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -243,7 +243,7 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return the points with the points of added bodies, and the latter alone; a body is placed after its base."""
+    """Return all points with added bodies, and the points of these bodies alone; a body follows the body it lies on."""
     there = list(there)
     waiting = list(add)
     new = scene.materials.seeded.of(_ids(scene.bodies, []))
@@ -265,7 +265,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return points without data from earlier stages, which added bodies do not have."""
+    """Return the points without data from earlier stages, which added bodies do not have."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -274,13 +274,13 @@ def _without_extra(
 
 
 def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
-    """Return the numbers of the points of the chosen bodies."""
+    """Return the numbers of the points of chosen bodies."""
     stop = np.cumsum([len(body) for body in bodies])
     return np.concatenate([np.empty(0, np.int64), *(np.arange(stop[i] - len(bodies[i]), stop[i]) for i in chosen)])
 
 
 def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
-    """Return points with new values of some of their data."""
+    """Return the points with new values of the data named in `fields`."""
     instance("stage: fields", fields, Mapping)
     data = dict(points.data)
     for name, value in fields.items():
