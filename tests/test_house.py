@@ -7,7 +7,7 @@ import pytest
 CEILINGS = {
     "ad hoc named numbers": 105,
     "rules among numbers in functions": 3,
-    "imports a file, mean": 5.69,
+    "imports a file, mean": 5.63,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
@@ -15,7 +15,7 @@ CEILINGS = {
     "assignments of three and more values": 20,
     "changes of hidden state": 9,
     "files that name a condition's class, most": 6,
-    "lines of the package": 37220,
+    "lines of the package": 37060,
 }
 
 

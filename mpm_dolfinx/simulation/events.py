@@ -27,13 +27,17 @@ Event = Callable[[Any], float]
 
 
 class Simulated(Protocol):
+<<<<<<< HEAD
+    """A `Simulation`, whose `state` a run replaces."""
+=======
     """A `Simulation`; `state` is replaced as a whole."""
+>>>>>>> b74ed01
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and the report of the step."""
+        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
 
 
 class Step(NamedTuple):

@@ -31,11 +31,10 @@ from mpm_dolfinx.simulation import summary
 from mpm_dolfinx.simulation.tangent import tangent
 from mpm_dolfinx.simulation.timeloop import run
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
-from mpm_dolfinx.stepping.initial_state import balanced
+from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked
-from mpm_dolfinx.stepping.stage_changes import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 

@@ -35,9 +35,9 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.timeloop import run
+from mpm_dolfinx.stepping.initial_state import begin_stage
 from mpm_dolfinx.stepping.result import GaveUp
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage_changes import begin_stage
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 from petsc4py import PETSc
 
@@ -14,9 +13,8 @@ from scipy.sparse import csr_matrix
 
 from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.simulation.events import Simulated
 from mpm_dolfinx.stepping.balances import balances
-from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import set_up
 
 
@@ -49,13 +47,6 @@ class Tangent:
     content: csr_matrix | None = None
     storage: csr_matrix | None = None
     cells: NDArray[np.int64] | None = None
-
-
-class Simulated(Protocol):
-    """An object with a scene and a state."""
-
-    scene: Scene
-    state: State
 
 
 def tangent(simulation: Simulated, dt: float) -> Tangent:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from inspect import signature
 from logging import INFO, WARNING
 from math import inf
-from typing import Any, Protocol
+from typing import Any
 
 from mpi4py import MPI
 
@@ -21,7 +21,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, Report, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.time_integration import EULER, Substep
+from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
 from mpm_dolfinx.dynamics.energies import begun
@@ -29,7 +29,7 @@ from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
-from mpm_dolfinx.simulation.events import Event, Events, Step
+from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
@@ -55,6 +55,8 @@ Observer = Callable[[Any], None]
 """A function of the simulation."""
 
 
+<<<<<<< HEAD
+=======
 class Simulated(Protocol):
     """Object that the time loop advances: a `Simulation`; the loop replaces `state`."""
 
@@ -65,6 +67,7 @@ class Simulated(Protocol):
         """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
 
 
+>>>>>>> b74ed01
 def run(
     simulation: Simulated,
     t_end: float,

@@ -1,38 +1,63 @@
 # SPDX-License-Identifier: MIT
+<<<<<<< HEAD
+"""The state at the start of each stage: of the first one, and after changes of bodies, conditions or point data.
+
+Given stresses and the scheme's error leave out-of-balance forces at the start.  Steps of the momentum balance at fixed
+pressures remove these forces.  Their deformation adds to the elastic strain of the points, whose positions do not
+change.
+=======
 """Initial state: given stresses and pore pressures, balanced with the loads.
 
 Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
 pressures remove these forces. Their deformation adds to the elastic strain of the points. Positions do not change.
+>>>>>>> b74ed01
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF
-from mpm_dolfinx.bodies.bodies import pressure_at
+from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF, SAME
+from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
+from mpm_dolfinx.bodies.bodies import Body, pressure_at
+from mpm_dolfinx.bodies.faces import Surface, surface
+from mpm_dolfinx.bodies.fills import put, touches
+from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Loads, Place
-from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.conditions.conditions import Quiet
+from mpm_dolfinx.conditions.sides import everywhere
+from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units, waters
+from mpm_dolfinx.contact.groups import contacts_of
+from mpm_dolfinx.contact.history import gripped, let_go
+from mpm_dolfinx.domains.fitted import fitted_at
+from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
+from mpm_dolfinx.dynamics.at_rest import borne
+from mpm_dolfinx.dynamics.quiet_sides import QuietSides, traction_name
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.materials.initial_stress import strained
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.materials.initial_stress import OfWater, strained
+from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.mechanics.tractions import owners
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
 from mpm_dolfinx.stepping.scene import Scene, When
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
@@ -47,6 +72,266 @@ REMARKABLE = 0.05
 
 Also the largest relative residual of the forces, due to errors of the discretisation.
 """
+
+
+def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
+    """Return the state of a scene in its first stage, with given stresses that are not balanced yet."""
+    present = [body not in later for body in range(len(scene.bodies))]
+    check_apart(scene.grid, scene.bodies, present)
+    begun = _stage(scene, conditions, present, later)
+    if scene.initial.given and (quiet := begun.of(Quiet)):
+        raise ValueError(
+            f"{next(iter(quiet))}: cannot hold an initial stress, must begin a stage later: first prescribe the side"
+        )
+    _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
+    if scene.fluid and scene.materials.conducts:
+        warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
+    points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
+    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
+    pieces = None
+    scene.rests_at(begun, 0.0)
+    if scene.fluid:
+        placed = callable(scene.initial.pressure) or scene.materials.retentions is not None
+        pieces = pieces_at_start(scene, points) if placed else at_start(points)
+    return State(
+        t=0.0,
+        points=_gripped(scene, begun, points),
+        pieces=pieces,
+        outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
+        stage=begun,
+    )
+
+
+def begin_stage(
+    scene: Scene,
+    state: State,
+    named: Mapping[str, Any],
+    add: Sequence[int],
+    remove: Sequence[int],
+    reset_displacement: bool,
+    fields: Mapping[str, ArrayLike],
+) -> State:
+    """Return the state at the beginning of a stage, see `Simulation.stage`; named: new conditions."""
+    before = state.stage
+    if "gravity" in named and scene.gravity is None:
+        raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
+    if "inertia" in named:
+        flag("stage: inertia", named["inertia"])
+        if scene.momentum.inertia is None:
+            raise ValueError("stage: inertia: the scene has none; for changes it must be created with inertia=False")
+    chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
+    chosen("stage: add", add, list(before.later), "bodies that are still to be added")
+    flag("stage: reset_displacement", reset_displacement)
+    present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
+    later = [body for body in before.later if body not in add]
+    conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
+    begun = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    if "gravity" in named or waters(begun.given) != waters(before.given):
+        _warn_weights(scene, begun, {})
+    if remove:
+        _warn_moved_on(scene, before, begun)
+    new_quiet = {name: one for name, one in begun.of(Quiet).items() if name not in begun.same(before)}
+    if new_quiet and before.inertia:
+        raise ValueError(f"{next(iter(new_quiet))}: must act from the first stage in which its bodies have inertia")
+    state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
+    scene.rests_at(before, state.t)
+    state = scene.followed(state)
+    if state.stays:  # points have the pressures of their cells, not of their pieces
+        state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    state = replace(state, stay=None)
+    own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
+    gone, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
+    there = [body for body, here in enumerate(before.present) if here and body not in remove]
+    bare, gravity = let_go(state.points, before.data_names(before.named)), None
+    if scene.initial.given:
+        gravity = begun.gravity_at(state.t)
+    if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
+        what = f"stage: add: body {add[0]}: domains of others have been renewed"
+        raise ValueError(f"{what}, must come before, or without Numerics(renewal=True)")
+    bare = _without_extra(scene, bare, add, fields) if add else bare
+    points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
+    others = before.data_names(before.named.keys() - begun.same(before))
+    points = _gripped(scene, begun, points, let_go(state.points, others))
+    for name, (ids, values) in tractions.items():
+        here, at = points.find(ids)
+        rows = points.data[name].copy()
+        rows[at] = values[here]
+        points = replace(points, data=points.data | {name: rows})
+    if pieces is not None:
+        pieces = pieces.of(gone, kept=False).joined(at_start(new))
+    points = _changed(scene, points, fields)
+    if begun.inertia and not before.inertia:
+        points = replace(points, data=points.data | resting(points))
+    if reset_displacement:
+        points = replace(points, origin=points.corners)
+    outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
+    rest = state.rest if _holds_as(begun, before) else None
+    new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    return replace(state, points=points, pieces=pieces, **new)
+
+
+def _released(
+    scene: Scene, state: State, begun: Stage, quiet: Mapping[str, Quiet]
+) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
+    """Return a state before the next step, and tractions on new quiet sides: points (m,) and (m, d), Pa, by data name.
+
+    The tractions balance stresses, loads of the previous stage, and remaining supports. begun: the new stage.
+    """
+    start = set_up(scene, state, 0.0)
+    state, momentum = start.state, scene.momentum
+    when, given = When(state.t, 1.0, start.acting[-1].gravity, 1.0, 0.0), (start.data, start.acting[-1].loads)
+    problem = scene.balance(when, start.matrices.momentum, *given, held=state.held)
+    forces = problem.unbalanced().reshape(-1, scene.grid.dim)
+    surfaces = next(of for of in begun.acting if isinstance(of, QuietSides)).named(quiet)
+    cut = start.on_grid.cut
+
+    def beside(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
+        """Return the components (nodes, d) along `axes` at nodes of cells that contain the faces `some`."""
+        nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
+        return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
+
+    now, then = ~begun.free, ~state.stage.free
+    for of, held in ((begun, now), (state.stage, then)):
+        for _, faces, axes in of.held:
+            held |= beside([faces], axes)
+    counts = ~now & (beside(list(surfaces.values()), range(scene.grid.dim)) | ~then)
+    owned = momentum.u.function_space.dofmap.index_map.size_local
+    given = scene.grid.comm, list(map(len, scene.bodies)), state.points
+    stresses = {
+        name: fitted_at(*given, faces.id, faces.xi.mean(axis=1), scene.materials.total_stress)
+        for name, faces in surfaces.items()
+    }
+    parts = start.matrices.momentum.parts
+    found = borne(cut, state.points, stresses, surfaces, parts, (forces * counts)[:owned], now)
+    return state, {traction_name(name): of for name, of in found.items()}
+
+
+def _gripped(
+    scene: Scene, begun: Stage, points: MaterialPoints, before: MaterialPoints | None = None
+) -> MaterialPoints:
+    """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
+    kept = begun.kept(len(points))
+    if taken := sorted(kept.keys() & scene.materials.seeded.data.keys()):
+        raise ValueError(f"{taken[0]!r}: points have data of this name, must be another name of a condition")
+    return gripped(points, kept, before)
+
+
+def _holds_as(begun: Stage, before: Stage) -> bool:
+    """Return whether the same conditions support the same faces."""
+    return len(begun.held) == len(before.held) and all(
+        hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
+        for (hold, faces, _), (was, then, _) in zip(begun.held, before.held, strict=True)
+    )
+
+
+def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
+    """Return the conditions with the scene's contacts, which stages cannot change."""
+    there, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
+    if given and given != there:
+        raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
+    return [*conditions, *(() if given else there)]
+
+
+def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+    of = scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum
+    return stage(*of, scene.storage.feeding if scene.storage else (), conditions, present, later)
+
+
+def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
+    """Warn of each water level, given or on a side, if its unit weight differs from the pore fluid's.
+
+    In a dry scene warn of each level with the unit weight of water, if gravity has another magnitude.
+    """
+    gravity, fluid = begun.conditions["gravity"], scene.fluid
+    g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
+    levels = [*given.items(), *waters(begun.named)]
+    if fluid is None:
+        levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
+        own, of = 1000 * g, "water under the scene's gravity"
+    else:
+        own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
+    weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
+    for name, weight in sorted(weights):
+        if abs(weight - own) > WEIGHS * max(weight, own):
+            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
+            warn(scene.grid.comm, ConditionWarning, f"{what}: at one level they are not at rest", name, weight, of, own)
+
+
+def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
+    """Warn of each unchanged condition that also acts on faces that an excavation has exposed."""
+    stop = np.cumsum([len(body) for body in scene.bodies])
+    for name, condition in begun.given.items():
+        if not hasattr(condition, "side") or before.given.get(name) is not condition:
+            continue
+        where = condition.side, getattr(condition, "region", None)
+        was, now = (surface(scene.bodies, *where, s.present) for s in (before, begun))
+        bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
+        here = np.repeat(before.present, [len(body) for body in scene.bodies])
+        new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))
+        if len(new):
+            area = bare[np.unique(now.id[new])].sum()
+            what = "stage: remove: %s is unchanged and now also acts on %.3g m^%d of newly exposed faces, first at %s"
+            values = line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0)
+            warn(scene.grid.comm, ConditionWarning, what, *values)
+
+
+def _filled(
+    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
+) -> tuple[MaterialPoints, MaterialPoints]:
+    """Return all points with added bodies, and the points of these bodies alone; a body follows the body it lies on."""
+    there = list(there)
+    waiting = list(add)
+    new = scene.materials.seeded.of(_ids(scene.bodies, []))
+    while waiting:
+        fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
+        placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
+        placed = put(scene.grid, scene.bodies, there, fill, points, placed)
+        placed = scene.initial.of(
+            scene.materials, placed, [i in (*there, *add) for i in range(len(scene.bodies))], gravity
+        )
+        if scene.momentum.inertia is not None:
+            placed = replace(placed, data=placed.data | resting(placed))
+        points, new = points.joined(placed), new.joined(placed)
+        there.append(fill)
+        waiting.remove(fill)
+    return points, new
+
+
+def _without_extra(
+    scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
+) -> MaterialPoints:
+    """Return the points without data from earlier stages, which added bodies do not have."""
+    extra = points.data.keys() - scene.materials.seeded.data.keys()
+    for name in sorted(extra - fields.keys()):
+        what = f"stage: add: body {add[0]}: its points have no {name!r}"
+        raise ValueError(f"{what}, must be given for all points in fields=")
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in extra})
+
+
+def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
+    """Return the numbers of the points of chosen bodies."""
+    stop = np.cumsum([len(body) for body in bodies])
+    return np.concatenate([np.empty(0, np.int64), *(np.arange(stop[i] - len(bodies[i]), stop[i]) for i in chosen)])
+
+
+def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
+    """Return the points with new values of the data named in `fields`."""
+    instance("stage: fields", fields, Mapping)
+    data = dict(points.data)
+    for name, value in fields.items():
+        if name not in data and name in scene.materials.constants:
+            law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
+            allowed = f"given to it as a function of position, lambda X: np.full(len(X), {value}), to be changed"
+            raise ValueError(f"stage: fields: {name!r}: a constant of {law}, must be {allowed}")
+        new, what = numbers(f"stage: fields: {name}", value, None, allowed="finite numbers"), f"stage: fields: {name!r}"
+        if name in data and new.shape == data[name].shape[1:]:
+            new = np.broadcast_to(new, data[name].shape)
+        if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
+            each = "one value for all, or " if name in data else ""
+            raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+        data[name] = new.copy()
+    points = replace(points, data=data)
+    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:

@@ -32,10 +32,11 @@ from mpm_dolfinx.conditions.conditions import (
 from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
-from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.pairing import Contacts
 from mpm_dolfinx.contact.ties import Ties
 from mpm_dolfinx.contact.tool import Tool
+from mpm_dolfinx.contact.tool_placing import Tools
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides
 from mpm_dolfinx.flow.drained_sides import DrainedSides
@@ -57,8 +58,8 @@ KINDS: tuple[type[Acting], ...] = (
     GivenDisplacements,
     QuietSides,
     Ties,
-    ToolsOfStage,
-    ContactsOfStage,
+    Tools,
+    Contacts,
 )
 """Loads in the balance of momentum, for conditions without a method `acting`."""
 FED: tuple[type[Feeding], ...] = (DrainedSides,)
