@@ -15,8 +15,8 @@ FIELDS = {
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
         "porosity": "-, current volume fraction of the pores",
         "saturation": "-, volume fraction of water in the pores, of unsaturated soil",
-        "owed, due": "-, volume defect divided by reference volume; the part of it that the next step corrects",
-        "softness": "-, elastic shear modulus divided by tangent modulus, where a law yields, 1 to 100",
+        "owed, due": "-, volume defect / reference volume; the part of it that the next step corrects",
+        "softness": "-, elastic shear modulus / tangent shear modulus, where a law yields, 1 to 100",
         "tool_pressure, tool_shear": "Pa, contact pressure and shear of the tool `tool` on the surface of the domain",
         "others": "state of the law (see its documentation), constants that vary in space, data of the user",
     },
@@ -31,20 +31,23 @@ FIELDS = {
     },
     "history.csv: one row for each output time": {
         "t, wall": "s, time in the scene; wall time so far",
-        "steps, newton, coupling, cuts, rederived": "steps, Newton and coupling iterations, shortened steps, domains
-        re-initialised", "balance, residual": "-, largest relative error so far of the fluid balance, and of the two
-        problems", "p_min, p_max": "Pa, smallest and largest pore pressure of the material points", "x_0, y_0, z_0": "m,
-        current position of probe 0; likewise for the other probes", "ux_0, uy_0, uz_0": "m, displacement of probe 0",
-        "p_0": "Pa, pore pressure at probe 0", "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress at
-        probe 0, tension positive", "reaction_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the prescribed
-        displacement NAME on the bodies", "wall_reaction_x_WALL, _y_, _z_": "N, in plane strain N/m, force of a wall of
-        the grid on the bodies", "tool_force_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the tool or contact
-        NAME on the bodies", "tool_force_moment_NAME": "N, in plane strain moment about its centre per metre; in 3D _x,
-        _y, _z, N m", "tool_travel_NAME": "m, displacement of the tool NAME under its load; of a free tool _x, _y, _z",
-        "tool_velocity_x_NAME, _y_, _z_": "m/s, velocity of the free tool NAME", "tool_rotation_NAME": "rad,
-        counterclockwise rotation of the free tool NAME, in 2D", "tool_spin_NAME": "rad/s, angular velocity of the free
-        tool NAME, in 2D", "energy_NAME": "J, in plane strain J/m, see `Result.energies`", "outflow_NAME": "m^3/s, in
-        plane strain m^2/s, outflow through the open side NAME",
+        "steps, newton, coupling, cuts, rederived": "steps, iterations (Newton, coupling), shortened steps, corrected domains",
+        "balance, residual": "-, largest relative error so far of the fluid balance, and of the two problems",
+        "p_min, p_max": "Pa, smallest and largest pore pressure of the material points",
+        "x_0, y_0, z_0": "m, current position of probe 0; likewise for the other probes",
+        "ux_0, uy_0, uz_0": "m, displacement of probe 0",
+        "p_0": "Pa, pore pressure at probe 0",
+        "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress at probe 0, tension positive",
+        "reaction_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the prescribed displacement NAME on the bodies",
+        "wall_reaction_x_WALL, _y_, _z_": "N, in plane strain N/m, force of a wall of the grid on the bodies",
+        "tool_force_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the tool or contact NAME on the bodies",
+        "tool_force_moment_NAME": "N, in plane strain moment about its centre per metre; in 3D _x, _y, _z, N m",
+        "tool_travel_NAME": "m, displacement of the tool NAME under its load; of a free tool _x, _y, _z",
+        "tool_velocity_x_NAME, _y_, _z_": "m/s, velocity of the free tool NAME",
+        "tool_rotation_NAME": "rad, counterclockwise rotation of the free tool NAME, in 2D",
+        "tool_spin_NAME": "rad/s, angular velocity of the free tool NAME, in 2D",
+        "energy_NAME": "J, in plane strain J/m, see `Result.energies`",
+        "outflow_NAME": "m^3/s, in plane strain m^2/s, outflow through the open side NAME",
     },
 }
 """Unit and meaning of each written field, by file and name."""

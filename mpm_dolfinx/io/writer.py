@@ -342,9 +342,7 @@ def _ours(file: Path) -> Iterator[None]:
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{file}: not written by a Writer ({line_of(error)}), must be, or take another folder"
-        ) from error
+        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or use another folder") from error
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
