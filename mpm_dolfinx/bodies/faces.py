@@ -145,7 +145,9 @@ def surface(
     if name is not None and (not isinstance(name, str) or name not in known):
         raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
     box = limits(region, dim)
-    around = [Faces.around(body) if here and sum(shown) > 1 else None for body, here in zip(bodies, shown, strict=True)]
+    around = [
+        Faces.around(body) if visible and sum(shown) > 1 else None for body, visible in zip(bodies, shown, strict=True)
+    ]
     none = np.empty(0, np.int64)
     start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):

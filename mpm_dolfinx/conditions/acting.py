@@ -155,8 +155,8 @@ class Loads:
     key: Any = None
     """Key of all dependences of the penalty except the positions of faces."""
 
-    def begun(self, shares: Shares, gone: Any) -> Loads:
-        """Return the loads for a substep with inertia; gone: result of `flown` in the previous substep."""
+    def begun(self, shares: Shares, earlier: Any) -> Loads:
+        """Return the loads for a substep with inertia; earlier: result of `flown` in the previous substep."""
         return self
 
     def flown(self, at: At) -> Any:

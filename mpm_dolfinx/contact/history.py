@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -33,22 +33,6 @@ def shear_name(name: str) -> str:
     return f"{name}_shear"
 
 
-def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
-    """Return points without the fields of these names."""
-    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
-
-
-def gripped(
-    points: MaterialPoints, new: Mapping[str, NDArray[np.float64]], before: MaterialPoints | None
-) -> MaterialPoints:
-    """Return points with new fields, where points present `before` keep their values."""
-    if before is not None:
-        here, at = before.find(points.id)
-        for name in new.keys() & before.data.keys():
-            new[name][here] = before.data[name][at]
-    return replace(points, data={**points.data, **new}) if new else points
-
-
 @dataclass(frozen=True, eq=False)
 class Origin:
     """Origin of contact pairs: their exchange to the owners of cells, and data (n,) before this exchange.
@@ -56,7 +40,7 @@ class Origin:
     point (n,): index of the material point on this process; number (n,): contact; area (n,): m^(d-1).
     """
 
-    travel: Exchange
+    exchange: Exchange
     point: NDArray[np.int64]
     number: NDArray[np.int64]
     area: NDArray[np.float64]
@@ -65,8 +49,8 @@ class Origin:
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
         """Return the points with mean pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
-        push = self.travel.back(push)
-        shear = self.travel.back(shear)
+        push = self.exchange.back(push)
+        shear = self.exchange.back(shear)
         data = dict(points.data)
         n = len(points)
         for number, (name, contact) in enumerate(contacts.items()):

@@ -32,7 +32,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
@@ -44,7 +44,6 @@ STIFF = 100.0
 GRIP = 6.0
 """k_t in units of (resistance) / (cell size): stiffer shears alternate from cell to cell without moving nodes."""
 DEPTH = 5e-4  # cells: allowed mean penetration
-TOUCH = 1e-13  # of the grid: gap of contact within rounding; light bodies penetrate less than 1e-8 cells
 SLIVER = 0.25  # of a cell's face: smaller contact areas count with less penetration
 ROUNDS = 20  # largest number of augmentations
 SLOW, STIFFER = 0.6, 10.0
@@ -84,8 +83,8 @@ class Touch:
 
     force (m, d): force on the points, N; push (m,): pressure, Pa; stiff (m,): -d push / d gap, Pa/m; pressure (k,):
     mean pressure, Pa; sticks (k,): whether in contact and stick; trial, shear (k, d): traction in stick, and actual
-    traction, Pa; most (k,): shear strength, Pa; grip (k, d, d): -d traction / d slip, Pa/m; rise (k, d): d traction / d
-    pressure.
+    traction, Pa; most (k,): shear strength, Pa; grip (k, d, d): -d traction / d slip, Pa/m; by_pressure (k, d): d
+    traction / d pressure.
     """
 
     force: NDArray[np.float64]
@@ -97,7 +96,7 @@ class Touch:
     shear: NDArray[np.float64]
     most: NDArray[np.float64]
     grip: NDArray[np.float64]
-    rise: NDArray[np.float64]
+    by_pressure: NDArray[np.float64]
 
 
 class ContactLaw:
@@ -153,7 +152,9 @@ class ContactLaw:
         """Return the contact of the pairs at a geometry."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
+        # only rounding: light bodies penetrate less than 1e-8 cells
+        rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
+        touches = (push > 0) | (at.gap <= rounding)
         pressure = self.mean(push)
         on = np.zeros(len(self.area), dtype=bool)
         normal = self.mean(at.n)
@@ -179,11 +180,11 @@ class ContactLaw:
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
         onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until an update
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
-        turns = hold * np.where(slips, onward * most / size, 1.0)
-        grip = turns[:, None, None] * (P - along[:, :, None] * along[:, None, :])
-        rise = (mu + RAMP * ramp)[:, None] * along
+        scale = hold * np.where(slips, onward * most / size, 1.0)
+        grip = scale[:, None, None] * (P - along[:, :, None] * along[:, None, :])
+        by_pressure = (mu + RAMP * ramp)[:, None] * along
         shear = np.where(slips[:, None], most[:, None] * along, trial)
-        return ~slips & on, trial, shear, most, grip, rise
+        return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
         """Return minus the derivative D (m d, m d) of the forces by w, without the rotation of shears."""
@@ -204,10 +205,10 @@ class ContactLaw:
         k, whole = len(self.area), self.area[:, None, None]
         blocks = (np.arange(k), np.arange(k + 1))
         grip = scipy.sparse.bsr_matrix((whole * touch.grip, *blocks), shape=(k * d, k * d))
-        rise = scipy.sparse.bsr_matrix((whole * touch.rise[:, :, None], *blocks), shape=(k * d, k))
+        by_pressure = scipy.sparse.bsr_matrix((whole * touch.by_pressure[:, :, None], *blocks), shape=(k * d, k))
         pressed = (touch.stiff[:, None] * at.n)[:, None]
         slope = scipy.sparse.bsr_matrix((pressed, np.arange(m), np.arange(m + 1)), shape=(m, m * d))
-        return (D + wide.T @ (grip @ wide + rise @ (mean @ slope))).tocsr()
+        return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
         """Return D v (m, d), or its adjoint, for v (m, d): see `tangent`."""
@@ -218,9 +219,9 @@ class ContactLaw:
         if self.grips:
             mean = self.mean(v)
             if adjoint:
-                out = out + touch.stiff[:, None] * at.n * (touch.rise * mean).sum(axis=1)[self.of, None]
+                out = out + touch.stiff[:, None] * at.n * (touch.by_pressure * mean).sum(axis=1)[self.of, None]
             else:
-                out = out + (touch.rise * self.mean(across))[self.of]
+                out = out + (touch.by_pressure * self.mean(across))[self.of]
             out = out + np.einsum("kji,kj->ki" if adjoint else "kij,kj->ki", touch.grip, mean)[self.of]
         return area * out
 
@@ -270,7 +271,7 @@ class ContactLaw:
     @property
     def rounding_of_gap(self) -> NDArray[np.float64] | float:
         """Rounding error of gaps, m; for each pair (m,), or for all."""
-        return 4 * EPSILON * self.pairs.reach
+        return 4 * EPSILON * self.pairs.largest_coordinate
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over each contact; collective."""

@@ -62,15 +62,15 @@ class Pairs:
     x: NDArray[np.float64]
     sign: NDArray[np.float64]
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at w (m, d), m, for displacements of tools by loads (contacts,), m, in the step.
 
-        travel: with free tools (contacts, q): displacements, m, and rotations, rad.
+        motion: with free tools (contacts, q): displacements, m, and rotations, rad.
         """
         raise NotImplementedError
 
     @property
-    def reach(self) -> NDArray[np.float64] | float:
+    def largest_coordinate(self) -> NDArray[np.float64] | float:
         """Largest coordinate in the calculation of gaps, m; for each pair (m,), or for all."""
         return self.grid.reach
 
@@ -100,7 +100,7 @@ class ToolPairs(Pairs):
     now: NDArray[np.float64]
     carried: NDArray[np.float64]
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
         d = self.grid.dim
         m = len(w)
@@ -109,15 +109,15 @@ class ToolPairs(Pairs):
         n = np.zeros((m, d))
         second = np.zeros((m, d, d))
         middle = np.zeros((m, d))
-        gone = travel if travel.ndim > 1 else travel[:, None] * [tool.along(d) for tool in self.tools]
+        shift = motion if motion.ndim > 1 else motion[:, None] * [tool.along(d) for tool in self.tools]
         x = self.now + w
-        carried = self.carried + gone[self.number, :d]
+        carried = self.carried + shift[self.number, :d]
         shear = self.shear.copy()
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
                 solid, rows = tool.solid(h), np.flatnonzero(self.number == number)
-                before, pose = pose, pose.gone(gone[number])
+                before, pose = pose, pose.moved(shift[number])
                 if pose.R is not before.R:
                     turn = pose.R @ before.R.T
                     carried[rows] = pose.put(before.own(self.carried[rows]))
@@ -132,7 +132,7 @@ class ToolPairs(Pairs):
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
-    def reach(self) -> NDArray[np.float64]:
+    def largest_coordinate(self) -> NDArray[np.float64]:
         """See `Pairs`: user functions are evaluated at true positions, so these determine the rounding error."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
@@ -143,19 +143,19 @@ class FacePairs(Pairs):
     """Points on the surface of one group, and opposite places along their normals on the faces of another.
 
     other (m,): lexicographic cell of the other side; y (m, d): position of the place in the grid, m; n (m, d): its
-    outward normal; apart (m, d): from the place to the point, without the displacement of the step, m; place (m,):
+    outward normal; offset (m, d): from the place to the point, without the displacement of the step, m; place (m,):
     number of the point, equal for all its pairs in a step.
     """
 
     other: NDArray[np.int64]
     y: NDArray[np.float64]
     n: NDArray[np.float64]
-    apart: NDArray[np.float64]
+    offset: NDArray[np.float64]
     place: NDArray[np.int64]
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`; moments refer to the positions at the start of the step."""
-        gap = np.einsum("md,md->m", self.n, self.apart + w)
+        gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -185,9 +185,9 @@ def at_nodes(
     numbers = unknowns.map.indices.reshape(-1, d)
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
-        travel = Exchange(grid.comm, grid.owner(other))
-        there = travel.back(numbers[grid.cell_nodes[grid.local(travel.send(other))]])
-        column = np.concatenate([column, there], axis=1)
+        exchange = Exchange(grid.comm, grid.owner(other))
+        columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
+        column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)
     value, m = np.broadcast_to(value[:, None], (len(value), d, value.shape[1])), len(cell) * d
     row = np.broadcast_to(np.arange(m).reshape(-1, d, 1), column.shape)

@@ -201,16 +201,7 @@ class StackedElementMatrices:
     twice the time to compile (13 s against 7 s). Merging the points of each octant of a cell, 8 in a cell, costs the
     convergence of Newton's method on a bending beam.
 
-    Parameters
-    ----------
-    tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points.
-    points
-        The points, with the field F (d, d).
-    symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: only half of the entries are then computed.
-    beside
-        Further sums.
+    Parameters: see `ElementMatrices`; the points have the field F (d, d).
     """
 
     def __init__(
