@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contact history of material points: pressures and shear tractions from step to step."""
+"""Contact history of material points: pressures and shear tractions that one step passes to the next."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Rough(Protocol):
-    """Strength of a tool or contact: mu, adhesion, Pa, and whether it resists slip."""
+    """Shear strength of a tool or contact: coefficient mu, adhesion, Pa, and whether the contact resists slip."""
 
     friction: float
     adhesion: float
@@ -35,20 +35,20 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Origin of contact pairs: their exchange to the owners of cells, and data (n,) before this exchange.
+    """Material points to which contact pairs belong; arrays (n,) before pairs are sent to the owners of cells."""
 
-    point (n,): index of the material point on this process; number (n,): contact; area (n,): m^(d-1).
-    """
-
-    exchange: Exchange
-    point: NDArray[np.int64]
-    number: NDArray[np.int64]
-    area: NDArray[np.float64]
+    exchange: Exchange  # sends the pairs to the owners of their cells
+    point: NDArray[np.int64]  # index of the material point on this process (n,)
+    number: NDArray[np.int64]  # number of the contact (n,)
+    area: NDArray[np.float64]  # contact area (n,), m^(d-1)
 
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with mean pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
+        """Return the points with the mean contact pressures and tractions of their pairs.
+
+        `push` (m,) and `shear` (m, d), Pa, are the pressures and shear tractions of the pairs.
+        """
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)

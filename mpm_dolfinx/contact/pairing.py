@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Contacts of groups in a stage: opposite places on their surfaces, and the contact history of points.
+"""Contacts between groups in a stage: pairs of opposite positions on their surfaces.
 
-The contact equations are in `problem`.
+`problem` has the contact equations.
 """
 
 from __future__ import annotations
@@ -38,55 +38,47 @@ from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 REACH = 2.0
-"""Largest gap, in cells, that may close in a step; steps with larger motion are rejected."""
+"""Largest gap, in cells, that may close in a step.  Steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Gap, in cells, above which faces do not touch before the next update of the pairs."""
+"""Gap, in cells, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration, in cells, above which a position is behind a thin body."""
+"""Penetration, in cells, above which a position lies behind a thin body and is not paired."""
 CANDIDATES = {2: 8, 3: 24}
-"""Number of nearest points on the other surface whose faces are tried."""
+"""Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""Distance, in cells, from points on the other surface within which corners follow the Q1 field."""
+"""Distance from points on the other surface, in cells, within which corners follow the Q1 field."""
 PLACES = 1 << 32
-"""Upper bound of a process's quadrature points on a surface."""
+"""Number that exceeds the quadrature points of any process on a surface."""
 
 
 class Facets(NamedTuple):
-    """Quadrature points on the faces of the other group, from all processes; arrays over n points.
+    """Quadrature points of all processes on the faces of one group; arrays over n points."""
 
-    x (n, d): m; face (n,): row of the `Surface`; cell (n,): lexicographic number; resistance (n,): Pa; corners, cut
-    (n, 2^(d-1), d): corners of the face at present and at the last grid reset, m; outward (n, d): unit normal.
-    """
-
-    x: NDArray[np.float64]
-    face: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    resistance: NDArray[np.float64]
-    corners: NDArray[np.float64]
-    cut: NDArray[np.float64]
-    outward: NDArray[np.float64]
+    x: NDArray[np.float64]  # position (n, d), m
+    face: NDArray[np.int64]  # row of the face in its `Surface` (n,)
+    cell: NDArray[np.int64]  # lexicographic cell (n,)
+    resistance: NDArray[np.float64]  # reference modulus (n,), Pa
+    corners: NDArray[np.float64]  # current corners of the face (n, 2^(d-1), d), m
+    cut: NDArray[np.float64]  # corners of the face at the last grid reset (n, 2^(d-1), d), m
+    outward: NDArray[np.float64]  # outward unit normal (n, d)
 
 
 class Pairs(NamedTuple):
-    """Points of one surface, and opposite places on the other; arrays over m pairs.
+    """Points of one surface, and opposite positions on the other surface; arrays over m pairs."""
 
-    row (m,): point among the patches of this process; facet (m,): one of the `Facets` on the opposite face; t (m, 2):
-    coordinates on this face; gap (m,): distance along the point's normal, m.
-    """
-
-    row: NDArray[np.int64]
-    facet: NDArray[np.int64]
-    t: NDArray[np.float64]
-    gap: NDArray[np.float64]
+    row: NDArray[np.int64]  # index of the point among the quadrature points of this process (m,)
+    facet: NDArray[np.int64]  # index in `Facets` of a point on the opposite face (m,)
+    t: NDArray[np.float64]  # coordinates of the opposite position on this face, in [0, 1] (m, 2)
+    gap: NDArray[np.float64]  # distance along the normal at the point (m,), m
 
 
 class Contacts(Touching):
-    """The contacts of groups in a stage.
+    """The contacts between groups in a stage.
 
     Parameters
     ----------
     setting, contacts
-        The stage, and its contacts by name.
+        Data of the stage, and its contacts by name.
     """
 
     conditions, title = (Contact,), "contacts"
@@ -100,7 +92,7 @@ class Contacts(Touching):
             both = contact.groups(len(sides.bodies))
             faces = [sides.around(group) for group in both]
             whole = [_extent([sides.bodies[i] for i in group]) for group in both]
-            swap = whole[1] < whole[0]  # equal in all stages, for any order of the bodies
+            swap = whole[1] < whole[0]  # the same in all stages, and for any order of the bodies
             self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
             signs.append(-1.0 if swap else 1.0)
         self._signs = np.array(signs)
@@ -108,7 +100,7 @@ class Contacts(Touching):
         self._cell_pairs: Latest[NDArray[np.int64]] = Latest()
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact between groups in a substep."""
+        """Return the loads by contact between groups in a substep."""
         cut, points = place.cut, place.points
         found = self._found(cut.key, lambda: self._opposite_all(cut, cut.points), self.grid.comm)
         cell_pairs = partial(self._cell_pairs, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
@@ -130,9 +122,9 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found at `seen`, with points that are now `present`.
+        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `present`.
 
-        points: at the start of the step, with the contact history.
+        `points` are the points at the start of the step, with the contact history.
         """
         grid = self.grid
         d = self.grid.dim
@@ -183,9 +175,9 @@ class Contacts(Touching):
         return [self._opposite(cut, *faces, points) for faces in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of lexicographic cells (m,), first * cells + second, that pairs may occupy in the step.
+        """Return all pairs of cells (m,), as number first * cells + second, that contact pairs may occupy in the step.
 
-        These are the cells of the initial pairs, and all neighbouring cells.
+        These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells.
         """
         grid = self.grid
         keys = []
@@ -204,7 +196,7 @@ class Contacts(Touching):
         return np.unique(np.concatenate(keys))
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
-        """Return points on faces of all processes, at the present positions of the points."""
+        """Return the quadrature points of all processes on the faces, at the current positions of the points."""
         patches, d = cut.surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.face]]
         now, then = (
@@ -225,14 +217,14 @@ class Contacts(Touching):
     def _opposite(
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
     ) -> tuple[Facets, Pairs]:
-        """Return the facets of the other group, and the pairs between points on the faces and these facets."""
+        """Return the facets of the other group, and the pairs of points on `faces` with these facets."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         count = min(CANDIDATES[d], len(facets.x))
-        if not count:  # the bodies of the other group are absent
+        if not count:  # no body of the other group is active
             none = np.zeros(0, dtype=np.int64)
             return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
         largest = REACH * (self.grid.least if self.grid.even else self.grid.most) + self.grid.most
@@ -253,16 +245,19 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) just inside faces at places x (m, d), if they hold a part of the face, else its own."""
+        """Return the cells (m,) just inside faces at positions x (m, d), or else the cells of the chosen facets.
+
+        A cell must contain a quadrature point of the face.
+        """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains are near another group and follow the Q1 field alone.
+        """Return which corners (n, 2^d, d) of domains are near another group, and follow the Q1 field alone.
 
-        points: at the start of the step.
+        `points` are the points at the start of the step.
         """
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
@@ -275,16 +270,16 @@ class Contacts(Touching):
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the shortest edges (...), m, of the cells at positions (..., d), m; one number for equal cells."""
+        """Return the shortest edges (...), m, of the cells at positions x (..., d), m; one number for equal cells."""
         return self.grid.least if self.grid.even else self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if groups overlap after a step, or may have passed through each other in it.
+        """Raise an error if groups overlap after a step, or may have passed through each other in the step.
 
         Raises
         ------
         NotConverged
-            With the place; a shorter step may succeed.
+            The message gives the position.  A shorter step may succeed.
         """
         h, comm = self._sizes(before.corners), self.grid.comm
         moved = points.corners - before.corners
@@ -299,12 +294,12 @@ class Contacts(Touching):
             raise NotConverged(message)
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if groups overlap at the start."""
+        """Raise an error if groups overlap at the start of the stage."""
         if message := self._too_deep(place.cut, place.points):
             raise ValueError(f"{message}, at the start t = {place.start:g} s, must touch or be apart")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
-        """Return a message with the depth and place of an overlap of groups, "" if there is none."""
+        """Return a message with depth and position of an overlap of groups, or "" if none overlap."""
         h, comm = self.grid.least, self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
             _, pairs = self._opposite(cut, faces, others, points)
@@ -317,7 +312,7 @@ class Contacts(Touching):
 
 
 class ContactLoads(ContactProblem):
-    """Contact between groups; the pairs follow the bodies.
+    """Loads by contact between groups; the contact pairs follow the motion of the bodies.
 
     Parameters
     ----------
@@ -336,33 +331,33 @@ class ContactLoads(ContactProblem):
         return self._contacts.near(self._cut, points, corners)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if groups overlap."""
+        """Raise an error if groups overlap after the step."""
         self._contacts.check_end(self._cut, points, before)
 
 
 def _extent(bodies: Sequence[Body]) -> tuple:
-    """Return a sort key of a group of bodies: its surface area, then its seeded extent."""
+    """Return a key that sorts groups of bodies by surface area, then by seeded extent."""
     area = surface(bodies, None).area0.sum()
     corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
     return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return tractions (m, d), rotated by the smallest angle into the planes with normals n (m, d)."""
+    """Return shear tractions (m, d), rotated by the smallest angle into the planes with normals n (m, d)."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 
 def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions (m, d) at coordinates t (m, 2) in [0, 1] on faces (m, 2^(d-1), d)."""
+    """Return the positions (m, d) at face coordinates t (m, 2) in [0, 1] on faces (m, 2^(d-1), d)."""
     if corners.shape[2] == 2:
         return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
     return np.einsum("mk,mkd->md", weights(t), corners)
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return coordinates (m, 2) and distances (m,) where lines from x (m, d) along n meet faces (m, 2^(d-1), d)."""
+    """Return face coordinates (m, 2) and distances (m,) of intersections of lines from x along n (m, d) with faces."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

@@ -2,17 +2,17 @@
 """Contact problem of a substep, with tools or between groups of bodies.
 
 With the relative displacements w = B u of the pairs, nodal forces are B^T f(w).  Forces on both bodies are therefore
-equal and opposite within rounding.  For two deformable sides, pairs, normals and gaps are at first taken from the
-start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This ends
-when the gaps match the faces at the end of the step.
+equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken at the start of the
+step.  After convergence they are updated at the new positions, and the step is solved again.  This is repeated until
+the gaps match the faces at the end of the step.
 
-The displacement a of a load-controlled tool along its direction e is one more unknown.  Let f(w - a e) be the forces on
-points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with the
-equilibrium of the bodies, by
+A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
+the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
+the equilibrium of the bodies, by
 
-    da = (e . D dw + load - e . f) / s,
+    da = (e . D dw + load - e . f) / s.
 
-so forces are f + D e (load - e . f) / s, and minus their derivative is D - (D e) (e . D) / s.
+Forces are therefore f + D e (load - e . f) / s; minus their derivative is D - (D e) (e . D) / s.
 """
 
 from __future__ import annotations
@@ -39,50 +39,43 @@ from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-FOLLOWS = 8  # largest number of pair updates in a step
+FOLLOWS = 8  # largest number of updates of the pairs in a step
 
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """Loads of k tools: names for errors; start (k,): displacement by the load before the step, m; direction (k, d):
-    unit vectors; load (k,): N, nan without.
-    """
+    """Loads of k load-controlled tools."""
 
-    names: Sequence[str]
-    start: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    load: NDArray[np.float64]
+    names: Sequence[str]  # of the tools, for error messages
+    start: NDArray[np.float64]  # displacement by the load before the step (k,), m
+    direction: NDArray[np.float64]  # unit vector of the load (k, d)
+    load: NDArray[np.float64]  # load (k,), N; nan for tools without a load
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMotion:
-    """Linearised displacements of k load-controlled tools in the step: motion (k,), m, at w (m, d), m, and elsewhere
+    """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-        motion + shift + sum slope . (w' - w),
-
-    with the sum over the pairs (m,) of each tool; Newton's method follows this line.
+    They are motion + shift + sum slope . (w' - w), with the sum over the pairs of a tool.  Newton's method uses them.
     """
 
-    w: NDArray[np.float64]
-    motion: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    slope: NDArray[np.float64]
+    w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
+    motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
+    shift: NDArray[np.float64]  # Newton increment of these displacements (k,), m
+    slope: NDArray[np.float64]  # derivative by the relative displacements of each pair (m, d)
 
 
 class Found(NamedTuple):
-    """Contact at some displacement: geometry, forces, and displacements of tools by loads (k,), m.
+    """Contact at given displacements."""
 
-    balanced (m, d): forces on the points, N, after the tools' Newton increment towards equilibrium with their loads.
-    """
-
-    at: Geometry
-    touch: Touch
-    motion: NDArray[np.float64]
-    balanced: NDArray[np.float64]
+    at: Geometry  # geometry of the pairs
+    touch: Touch  # forces of the pairs
+    motion: NDArray[np.float64]  # displacements of tools by loads (k,), m
+    balanced: NDArray[np.float64]  # forces on points after the Newton increment of the tools (m, d), N
 
 
 class Current(NamedTuple):
-    """Contact law of the present pairs, their origin, and the state of the iterations."""
+    """Contact law of the current pairs, their material points, state of the iterations, and motions of tools."""
 
     law: ContactLaw
     origin: Origin
@@ -91,7 +84,7 @@ class Current(NamedTuple):
 
 
 class SubstepMotion(NamedTuple):
-    """Motion of tools in a substep with time weight own, s: their poses, and the flight of free tools."""
+    """Motion of tools in a substep with time weight `own`, s: their poses, and the `Flight` of free tools."""
 
     own: float
     poses: Any
@@ -99,12 +92,12 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of a stage: tools, or contacts of groups.
+    """Contact conditions of one kind in a stage: either tools, or contacts between groups.
 
     Parameters
     ----------
     setting, given
-        The stage, and its tools or contacts by name.
+        Data of the stage, and its tools or contacts by name.
     """
 
     linear = False
@@ -116,31 +109,31 @@ class Touching(Acting):
         self.symmetric = not any(self._grips)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero histories of n points: pressures (n,), Pa, and tractions (n, d), Pa, if there is friction."""
+        """Return zero histories of n points: pressures (n,) and, if a contact resists slip, tractions (n, d), Pa."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, grips in zip(self.names, self._grips, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
         return out
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments, filled with this value."""
+        """Return forces and moments on the bodies, all filled with this value."""
         rows = np.full((len(self.names), 3 if self.grid.dim == 2 else 6), value)
         return {"tool_forces": dict(zip(self.names, rows, strict=True))}
 
 
 class ContactProblem(Loads):
-    """Contact as a load; `now` is replaced during the solution.
+    """Contact forces in a substep.  `now` is replaced during the solution.
 
     Parameters
     ----------
     law, origin
-        Contact law at the start of the step, and origin of its pairs.
+        Contact law at the start of the step, and the material points of its pairs.
     pushes
         Loads of tools.
     again
-        Function that returns law and origin of the pairs at displacements, a local array, m, see `FacePairs`.
+        Function from displacements, a local array, m, to law and origin of the pairs there, see `FacePairs`.
     cell_pairs
-        Function that returns all pairs of lexicographic cells of this process's pairs, first * cells + second.
+        Function that returns all pairs of lexicographic cells of this process's pairs, as first * cells + second.
     """
 
     linear, smooth, touches = False, False, True
@@ -165,12 +158,12 @@ class ContactProblem(Loads):
 
     @property
     def pairs(self) -> Pairs:
-        """The present pairs."""
+        """The current contact pairs."""
         return self.now.law.pairs
 
     @property
     def pushed(self) -> bool:
-        """Whether loads push tools."""
+        """Whether any tool is load-controlled."""
         return self.pushes is not None and not np.isnan(self.pushes.load).all()
 
     @property
@@ -179,18 +172,18 @@ class ContactProblem(Loads):
         return self.pushed or self._cell_pairs is not None
 
     def found(self, at: At) -> Found:
-        """Return the contact at u."""
+        """Return the contact at the displacements u."""
         key = self.now, at.unknowns, at.u[at.unknowns.owned]
         return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
-        """Return w (m, d), m, of the pairs of a law."""
+        """Return the relative displacements w (m, d), m, of the pairs of a law."""
         B, w = self._B(law, at.unknowns)
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         return w.array_r.reshape(-1, self.grid.dim).copy()
 
     def _B(self, law: ContactLaw, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
-        """Return B of the pairs of a law, and a vector for its product."""
+        """Return the matrix B of the pairs of a law, and a vector for products with B."""
 
         def make() -> tuple[PETSc.Mat, PETSc.Vec]:
             B = law.pairs.operator(unknowns)
@@ -214,14 +207,14 @@ class ContactProblem(Loads):
         return found._replace(balanced=touch.force + more)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract the forces at u."""
+        """Subtract the contact forces at u."""
         B, w = self._B(self.now.law, at.unknowns)
         w.array_w[:] = -self.found(at).balanced.ravel()
         B = B if on is at.unknowns else self.pairs.operator(on)
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the pattern of `coupling` in the step, beyond that of cells; None if none."""
+        """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
         for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
@@ -232,7 +225,7 @@ class ContactProblem(Loads):
         return out
 
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a matrix with the pattern of pairs that follow the bodies."""
+        """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
         exchange = Exchange(grid.comm, grid.owner(cell))
@@ -249,7 +242,7 @@ class ContactProblem(Loads):
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
-        collect_garbage(self.grid.comm)  # pairs with friction fill 60 MB for 12 cells in 3D, in each iteration
+        collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
         found = self.found(at)
         law = self.now.law
         unknowns = at.unknowns
@@ -266,7 +259,7 @@ class ContactProblem(Loads):
         return K
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return B^T of values (m, d) at the pairs."""
+        """Return B^T v for values v (m, d) at the pairs."""
         B, w = self._B(self.now.law, unknowns)
         w.array_w[:] = values.ravel()
         out = unknowns.vector()
@@ -274,7 +267,7 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (tools,), m, by loads at w (m, d), m, along the last Newton step."""
+        """Return the displacements (tools,), m, of tools by loads at w (m, d), m, from the last linearisation."""
         linear, h = self.now.linear, self.grid.least
         if not over_all(self.grid.comm, int((w != linear.w).any())):
             return linear.motion
@@ -282,7 +275,7 @@ class ContactProblem(Loads):
         return np.clip(linear.motion + linear.shift + more, -h, h)
 
     def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
-        """Return the linearised displacements of tools."""
+        """Return the displacements of tools, linearised about `motion` (tools,), m, for pairs at w (m, d), m."""
         law, of = self.now.law, self.pairs.number
         at, touch, *_ = found = self._find_at(w, motion)
         _, slope, _ = self._reactions(found)
@@ -301,9 +294,9 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the displacements (tools,), m, at which a single place would bear the load, and which tools touch.
+        """Return the displacements (tools,), m, at which one contact point would carry the load, and which tools touch.
 
-        Infinity if there is no such place.
+        A displacement is infinite if there is no such point.
         """
         law = self.now.law
         state = self.now.state
@@ -318,15 +311,15 @@ class ContactProblem(Loads):
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
 
     def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return the Newton increments (tools,), m, of tools towards equilibrium with their loads."""
+        """Return the Newton increments (tools,), m, with which reactions approach the loads."""
         reaction, slope, _ = self._reactions(found)
         off = np.nan_to_num(self.pushes.load - reaction)
         far, touches = self._seek(found)
-        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # pure slip does not stiffen
+        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # slip alone has no stiffness
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return initial displacements (tools,), m, for fixed bodies, at most until a single place bears the load."""
+        """Return initial displacements (tools,), m, for fixed bodies, at most until one point carries the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -338,7 +331,7 @@ class ContactProblem(Loads):
         return motion
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update the slipping set at u and, if sticks, returns to stick; return whether the set changed."""
+        """See `Loads`.  The slipping set consists of the conditions that slip."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
         motion = self.found(at).motion
         if self.now.law.grips:
@@ -351,7 +344,7 @@ class ContactProblem(Loads):
     def augment(self, at: At) -> bool:
         """Augment the pressures if mean penetrations at u are too large; return whether forces changed.
 
-        Otherwise move tools whose reaction differs from their load.
+        If penetrations are small enough, move tools whose reaction differs from the load.
         """
         found = self.found(at)
         law = self.now.law
@@ -379,7 +372,7 @@ class ContactProblem(Loads):
         return True
 
     def follow(self, at: At) -> bool:
-        """Update the pairs at u, a local array, m; return whether this changes the equilibrium."""
+        """Update the pairs at u; return whether this changes the equilibrium."""
         if self._again is None or self.now.state.follows == FOLLOWS:
             return False
         new = Current(*self._again(at.u), self.now.state)
@@ -390,9 +383,9 @@ class ContactProblem(Loads):
         return True
 
     def _continued(self, new: Current, at: At) -> tuple[Current, float]:
-        """Return the contact with pairs found at u, and the largest difference of gaps from the present ones, cells.
+        """Return the contact with pairs found at u, and the largest change of a gap from the current pairs, cells.
 
-        Pairs that are open in both are ignored.
+        Pairs that are open before and after are ignored.
         """
         found = self.found(at)
         law = self.now.law
@@ -416,16 +409,16 @@ class ContactProblem(Loads):
         return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with the contact pressures and shear tractions at u."""
+        """Return the points with updated contact pressures and shear tractions at u."""
         law, origin, *_ = self.now
         contacts = dict(zip(law.names, law.contacts, strict=True))
         found = self.found(at)
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`: only tools do work; elastic slip in stick is counted as dissipation, and returned on unloading.
+        """See `Loads`.  Only tools do work.  Elastic slip in stick counts as dissipation, and is returned on unloading.
 
-        Pressures count as doing no work, because velocities of substeps jump where a gap closes in a step.
+        Contact pressures are taken to do no work: velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)
@@ -439,11 +432,11 @@ class ContactProblem(Loads):
         return -float((shear * (moves - tool)).sum()), more
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """Return the velocities (m, d), m/s, of places on tools; zero for two deformable sides."""
+        """Return the velocities (m, d), m/s, of contact positions on tools; zero if both sides deform."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and displacements by loads, m."""
+        """See `Loads`: forces and moments on the bodies, (3,) or in 3D (6,), N, N m, and displacements by loads, m."""
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
@@ -452,7 +445,7 @@ class ContactProblem(Loads):
         return out
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:
-        """Return cells (m,), cells of deformable other sides, positions and directions (m, d) of initial contact."""
+        """See `Loads`.  With friction or adhesion, contact constrains all directions."""
         at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
         law = self.now.law
         d = self.grid.dim
@@ -464,7 +457,7 @@ class ContactProblem(Loads):
         return self.pairs.cell[rows], None if other is None else other[0][rows], self.pairs.x[rows], along
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors, which include gaps between large coordinates."""
+        """See `Loads`.  Gaps are differences of large coordinates."""
         if self.pairs.other_side() is not None:
             return of_cells
         out, cells = of_cells.copy(), self.pairs.cell
@@ -473,14 +466,14 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error of forces in cells of other sides, N."""
+        """Rounding error of forces in cells of other sides that deform, N."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
-    """Return a b^T without zero rows and columns."""
+    """Return the matrix a b^T, without entries in zero rows and columns."""
     start, comm = b.owner_range[0], b.comm.tompi4py()
     rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
     at, value = start + columns, b.array_r[columns]

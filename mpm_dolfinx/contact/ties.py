@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Tied sides: two opposite sides of the ground move alike, as if it went on beyond them.
+"""Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-A penalty on the difference of the displacements of places at equal height, k/2 int |u_one - u_other|^2 dA.  It is
-measured from the seeded positions, so its error does not accumulate.  Forces on both sides are equal and opposite.
+A penalty resists the difference of the displacements at equal heights: k/2 int |u_one - u_other|^2 dA.  Displacements
+are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and opposite.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 class Tie:
-    """Two opposite sides, and the faces that belong together.
+    """Two opposite tied sides, and the faces at equal heights.
 
-    partner (m,): face of the other side for each face of one side; offset (m, d): from one to the other, m;
-    axis: normal.
+    `partner` (m,) is the face of the other side for each face of one side.  `offset` (m, d), m, is the vector between
+    both faces.  `axis` is the axis normal to them.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
@@ -53,12 +53,12 @@ class Ties(Acting):
     Parameters
     ----------
     setting, ties
-        The stage, and its tied sides by name.
+        Data of the stage, and the tied sides by name.
 
     Raises
     ------
     ValueError
-        The sides are not opposite, or have other faces.
+        The sides are not opposite, or their faces differ.
     """
 
     conditions, title = (Tied,), "tied sides"
@@ -74,7 +74,7 @@ class Ties(Acting):
         return [tie.one for tie in self._ties]
 
     def placed(self, place: Place) -> Loads:
-        """Return the penalty in a substep."""
+        """Return the penalty forces in a substep."""
         grid, points = self._grid, place.points
         d, rows = grid.dim, []
         modulus = self._materials.table(points, holding)
@@ -99,16 +99,16 @@ class Ties(Acting):
 
 
 class TieLoads(Loads):
-    """Tied sides in a substep.
+    """Penalty forces of tied sides in a substep.
 
     Parameters
     ----------
     cell, x : (m,), (m, d), m
-        Local cells and positions on one side.
+        Local cells, and positions in them, on one side.
     other, y : (m,), (m, d), m
-        Lexicographic cells and positions on the other side.
+        Lexicographic numbers of cells of any process, and positions in them, on the other side.
     stiffness : (m,), N/m
-        Penalties.
+        Penalty stiffness.
     gap : (m, d), m
         Differences of displacements at the start of the step.
     """
@@ -122,11 +122,11 @@ class TieLoads(Loads):
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix that gives differences of displacements (m d,), m, from the unknowns."""
+        """Return the matrix B, which maps the unknowns to differences of displacements (m d,), m."""
         return at_nodes(self._grid, unknowns, self._cell, self._values, self._other)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Add the resistance at u."""
+        """Add the penalty forces at u."""
         B = self._B(at.unknowns)
         w = B.createVecLeft()
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
@@ -141,7 +141,7 @@ class TieLoads(Loads):
         return out
 
     def coupling(self, at: At) -> PETSc.Mat:
-        """Return the derivative of the resistance."""
+        """Return the derivative of the penalty forces."""
         return self._coupling(at.unknowns)
 
     def _coupling(self, unknowns: Unknowns) -> PETSc.Mat:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The state at the start of each stage: of the first one, and after changes of bodies, conditions or point data.
+"""State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
 
-Given stresses and the scheme's error leave out-of-balance forces at the start.  Steps of the momentum balance at fixed
-pressures remove these forces.  Their deformation adds to the elastic strain of the points, whose positions do not
-change.
+Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
+pressures remove these forces. Their deformation adds to the elastic strain of the points. Positions do not change.
 """
 
 from __future__ import annotations
@@ -54,20 +53,20 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Mixed iterations; the iteration ends after PATIENCE ones that do not reduce the residual by the factor LESS.
+"""Iterations that are mixed; iterations, PATIENCE, without reduction of the residual by the factor LESS to end.
 
-A wet bank, its law elastic or frictional, blocks on a rough base, a half held one: forces left 4e-5 to 3e-9 with 40 and
-16 and with 80 and 24, in as many iterations; with 40 and 8 up to 6e-3.
+Tests: a wet bank, elastic or frictional, blocks on a rough base, one of them half supported. With 40 and 16 and with 80
+and 24 the remaining forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Change of stress in the balance, over the largest given stress, from which a warning is given.
+"""Change of stress by balancing / largest given stress, above which a warning is given.
 
-Also the largest relative residual of the forces, due to the scheme's error.
+Also the largest relative residual of the forces, due to errors of the discretisation.
 """
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene at rest, in its first stage, with given stresses that are not balanced yet."""
+    """Return the state of a scene in its first stage, with given stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     first = _stage(scene, conditions, present, later)
@@ -104,7 +103,7 @@ def begin_stage(
     reset_displacement: bool,
     fields: Mapping[str, ArrayLike],
 ) -> State:
-    """Return the state at the beginning of a stage: see `Simulation.stage`; named: the new conditions."""
+    """Return the state at the beginning of a stage, see `Simulation.stage`; named: new conditions."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
@@ -129,7 +128,7 @@ def begin_stage(
     state, tractions = _released(scene, state, after, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
     state = scene.followed(state)
-    if state.stays:  # points have the pressures of their cells
+    if state.stays:  # points have the pressures of their cells, not of their pieces
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
     own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
@@ -166,9 +165,9 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return a state at rest, and tractions (m, d), Pa, on points (m,) of new quiet sides, by names of data.
+    """Return a state before the next step, and tractions on new quiet sides: points (m,) and (m, d), Pa, by data name.
 
-    They balance stresses, loads of the previous stage, and remaining supports. after: the stage with the quiet sides.
+    The tractions balance stresses, loads of the previous stage, and remaining supports. begun: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -179,7 +178,7 @@ def _released(
     cut = start.on_grid.cut
 
     def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return the components (nodes, d) along `axes` of nodes in cells with the faces `some`."""
+        """Return the components (nodes, d) along `axes` at nodes of cells that contain the faces `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
@@ -202,19 +201,19 @@ def _released(
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return points with their data of conditions: initial values, or values of the same points `before`."""
-    new = after.kept(len(points))
-    if clashes := sorted(new.keys() & scene.materials.seeded.data.keys()):
+    """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
+    kept = after.kept(len(points))
+    if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, must be another name of a condition")
     if before is not None:
         known, at = before.find(points.id)
-        for name in new.keys() & before.data.keys():
-            new[name][known] = before.data[name][at]
-    return replace(points, data={**points.data, **new}) if new else points
+        for name in kept.keys() & before.data.keys():
+            kept[name][known] = before.data[name][at]
+    return replace(points, data={**points.data, **kept}) if kept else points
 
 
 def _without_data(points: MaterialPoints, names: Collection[str]) -> MaterialPoints:
-    """Return points without the data of these names."""
+    """Return the points without the data of these names."""
     return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
 
 
@@ -227,7 +226,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return conditions with the scene's contacts, which stages cannot change."""
+    """Return the conditions with the scene's contacts, which stages cannot change."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and given != standing:
         raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
@@ -240,7 +239,7 @@ def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool],
 
 
 def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
-    """Warn of each unchanged condition that also acts on faces exposed by an excavation."""
+    """Warn of each unchanged condition that also acts on faces that an excavation has exposed."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in after.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -260,7 +259,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return the points with the points of added bodies, and the latter alone; a body is placed after its base."""
+    """Return all points with added bodies, and the points of these bodies alone; a body follows the body it lies on."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -282,7 +281,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return points without data from earlier stages, which added bodies do not have."""
+    """Return the points without data from earlier stages, which added bodies do not have."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -291,7 +290,7 @@ def _without_extra(
 
 
 def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
-    """Return points with new values of some of their data."""
+    """Return the points with new values of the data named in `fields`."""
     instance("stage: fields", fields, Mapping)
     data = dict(points.data)
     for name, value in fields.items():
@@ -311,7 +310,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of pieces for a pressure field; cells have the field's values at their centroids."""
+    """Return the pressures of the pieces for a pressure field; cells have the field's values at their centroids."""
     on_grid = scene.on_grid(points)
     grid = scene.grid
     pressure = scene.initial.pressure
@@ -338,17 +337,17 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 
 
 def balanced(scene: Scene, state: State) -> State:
-    """Return a state with stresses in equilibrium with the loads at its time, at its pore pressures.
+    """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
-    A displacement w of the grid is balanced with the strains of the pieces; points keep the mean strain of their
+    A displacement w of the grid is balanced with the strains of the pieces. Points store the mean strain of their
     domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes: nodal forces hold the remainder, `State.held`. Support forces are evaluated at the
-    displacement w, `State.rest`: the sides keep their seeded positions, whatever is prescribed at the start.
+    strains cannot balance all nodes; nodal forces balance the remainder, `State.held`. Support forces are evaluated at
+    the displacement w, `State.rest`: sides keep their seeded positions for any prescribed displacement at the start.
 
     Raises
     ------
     ValueError
-        The laws admit no such equilibrium.
+        There is no equilibrium with these laws.
     """
     forms, materials = scene.momentum, scene.materials
     try:
@@ -397,9 +396,9 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes of the balance; refuse a large relative residual.
+    """Log the changes by balancing; raise ValueError for a large relative residual.
 
-    Contact (touches) is found in the first step only: a residual is then a warning.
+    With contact (touches), which is detected only in the first step, a large residual causes a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -416,13 +415,13 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a displacement of the nodes, m, a local array; it is zero outside the cells of supported sides."""
+    """Return a displacement w of the nodes, m, a local array, set to zero outside the cells of supported sides."""
     nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
     return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the balance of momentum at zero displacement and zero rates, for points strained by u."""
+    """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
@@ -431,7 +430,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
 
 
 def _as_reset(scene: Scene, start: Start) -> State:
-    """Return the state at the start, as after a reset of the grid without motion."""
+    """Return the state at the start, in the form after a reset of the grid without motion."""
     cut, pieces = start.on_grid.cut, None
     if scene.storage is not None:
         p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
@@ -441,7 +440,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration from earlier ones and their steps; local arrays, m."""
+    """Return the next displacement of a fixed-point iteration; seen: earlier displacements and steps, local arrays."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

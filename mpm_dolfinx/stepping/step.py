@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One step of a scene: the algorithm, in its only place."""
+"""One step of a scene: the complete algorithm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
-    """Return the start of a step of dt (s): the state on the grid, matrices, and the loads of the substeps."""
+    """Return the start of a step of dt, s: the state on the grid, matrices, and the loads of the substeps."""
     scene.check(state)
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
@@ -30,7 +30,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     state, renewed = scene.for_reset(scene.followed(state), dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
-    on_grid.cut.surfaces(stage.surfaces)  # cut together
+    on_grid.cut.surfaces(stage.surfaces)  # all faces are cut together
     data = on_grid.data_of(state)
     place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome, stage.inertia)
     if state.begins:
@@ -46,7 +46,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
-    """Return the state after a step of dt (s), and its report; `state` is unchanged, even after an error."""
+    """Return the state after a step of dt, s, and its report; `state` is unchanged, even after an error."""
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
