@@ -648,7 +648,7 @@ def assembled(
 
     def make() -> System:
         if not stage.inertia and not any(one.holding for one in loads):
-            check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
+            check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
         return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
