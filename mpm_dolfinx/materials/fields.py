@@ -36,12 +36,12 @@ WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Change of a state variable from its initial value above which a point counts as yielded.
 
-Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 6.6e-05, twice by 1.4e-04, finer cells by 3.0e-02.
 """
 STIFFEST = 100.0
 """Upper limit of alpha^2 / S, divided by the skeleton's modulus lambda + 2G; it limits rounding errors.
 
-Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 1.2e-07, twice by 1.0e-07, finer cells by 3.0e-02.
 """
 
 
