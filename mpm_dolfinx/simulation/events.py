@@ -27,11 +27,7 @@ Event = Callable[[Any], float]
 
 
 class Simulated(Protocol):
-<<<<<<< HEAD
-    """A `Simulation`, whose `state` a run replaces."""
-=======
     """A `Simulation`; `state` is replaced as a whole."""
->>>>>>> b74ed01
 
     scene: Scene
     state: State

@@ -55,19 +55,6 @@ Observer = Callable[[Any], None]
 """A function of the simulation."""
 
 
-<<<<<<< HEAD
-=======
-class Simulated(Protocol):
-    """Object that the time loop advances: a `Simulation`; the loop replaces `state`."""
-
-    scene: Scene
-    state: State
-
-    def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
-
-
->>>>>>> b74ed01
 def run(
     simulation: Simulated,
     t_end: float,

@@ -1,16 +1,8 @@
 # SPDX-License-Identifier: MIT
-<<<<<<< HEAD
-"""The state at the start of each stage: of the first one, and after changes of bodies, conditions or point data.
-
-Given stresses and the scheme's error leave out-of-balance forces at the start.  Steps of the momentum balance at fixed
-pressures remove these forces.  Their deformation adds to the elastic strain of the points, whose positions do not
-change.
-=======
-"""Initial state: given stresses and pore pressures, balanced with the loads.
+"""State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
 
 Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
 pressures remove these forces. Their deformation adds to the elastic strain of the points. Positions do not change.
->>>>>>> b74ed01
 """
 
 from __future__ import annotations
