@@ -65,7 +65,7 @@ class DruckerPrager(Frictional):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     hardening: Field = 0.0

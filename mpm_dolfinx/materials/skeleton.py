@@ -493,7 +493,7 @@ class Fluid:
     Raises
     ------
     ValueError
-        A constant out of its range.
+        A constant is out of its range.
     """
 
     bulk: float = 2.2e9

@@ -376,7 +376,7 @@ class SaturationAt:
     def __call__(
         self, rows: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return S, dS/dp, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): fields `retention`."""
+        """Return S, dS/dp, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): the field `retention`."""
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
         return S, slope, chi, k
