@@ -15,12 +15,12 @@ from mpm_dolfinx.points.cutting import FACES
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overburden stress (m,), Pa, at positions, and the surface level (m,), m, above them.
+    """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
-        Convex domains of all bodies; the last axis is vertical.
+        Corners of the convex particle domains of all bodies; the last axis is vertical.
     unit_weight : (n,), N/m^3
         Unit weights of the domains.
     x : (m, d), m
@@ -43,7 +43,7 @@ def overburden(
     top = top[crossed]
     surface = np.full(len(across), -np.inf)
     np.maximum.at(surface, ray, top)
-    # positions on one vertical line share cumulative sums, sorted by line and height
+    # positions on the same vertical line share cumulative sums, sorted by line and height
     order = np.lexsort((bottom, ray))
     ray = ray[order]
     weight = weight[order]
@@ -59,7 +59,7 @@ def overburden(
 
 
 def _chord(corners: NDArray, across: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the heights (m,), (m,), m, at which vertical lines at (m, d-1) enter and leave domains (m, 2^d, d)."""
+    """Return the heights (m,), m, at which vertical lines at (m, d-1) enter and leave domains (m, 2^d, d)."""
     d = corners.shape[2]
     for face in range(2 * d):
         n, on = face_vectors(corners, face), corners[:, FACES[d][face]].mean(axis=1)
