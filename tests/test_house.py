@@ -18,6 +18,8 @@ CEILINGS = {
     "lines of the package": 36930,
 }
 
+HALF = "half the value changes the result by"
+
 
 @pytest.fixture(scope="module")
 def measures():
@@ -39,8 +41,8 @@ def test_every_measure_has_a_ceiling(measures):
         ("Half of a cell.", False),
         ("Source: it works well", False),
         ("Source: Higham (2002), eq. 3.4.", True),
-        ("Plateau (bank): halved 1e-5, doubled 2e-5, cells 3e-3.", True),
-        ("Plateau (bank): halved 1e-5, doubled 4e-3, cells 3e-3.", False),
+        (f"Sensitivity (bank scene): {HALF} 1e-5, twice by 2e-5, finer cells by 3e-3.", True),
+        (f"Sensitivity (bank scene): {HALF} 1e-5, twice by 4e-3, finer cells by 3e-3.", False),
     ],
 )
 def test_number_has_a_source_or_moves_less_than_the_cells(said, holds):

@@ -33,7 +33,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 INCLINED = 0.01
 """Inclination of layers above which the pressure position of a cell moves to the most conductive part.
 
-Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03 (relative changes of the result).
+Sensitivity (slope scene): half the value changes the result by 4.1e-04, twice by 5.0e-05, finer cells by 3.4e-03.
 """
 PAIRS = 2**16
 """Number of pairs of pieces that are processed together."""

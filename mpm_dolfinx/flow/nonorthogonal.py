@@ -32,12 +32,12 @@ ALONG = 1e-4
 NEAREST = 0.1
 """Lower bound, in cells, of the distances in the weights of the least-squares fit.
 
-Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03 (relative changes of the result).
+Sensitivity (slope scene): half the value changes the result by 3.0e-08, twice by 1.2e-06, finer cells by 3.4e-03.
 """
 SIDES = 2.0
 """Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.
 
-Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03 (relative changes of the result).
+Sensitivity (slope scene): half the value changes the result by 4.8e-06, twice by 2.8e-06, finer cells by 3.4e-03.
 """
 
 

@@ -46,12 +46,12 @@ REBALANCED = 6  # largest number of iterations with changing contacts / largest 
 LOOSEST = 1e-2
 """Largest residual after a linear solve / residual before the solve.
 
-Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.2e-11, twice by 6.0e-12, finer cells by 3.0e-02.
 """
 SOLVED = 0.05
 """Residual after the last linear solve / tolerance.
 
-Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-12, twice by 3.1e-11, finer cells by 3.0e-02.
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end: above it the contact area still changes
 ERROR = 1 / 20
