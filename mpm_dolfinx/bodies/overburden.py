@@ -20,14 +20,14 @@ from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_b
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overburden stress (m,), Pa, at positions, and the surface level (m,), m, above them.
+    """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
 
     Both are means over lines on all sides of a position, because a border of domains may lie above it.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
-        Domains of all bodies; the last axis is vertical.
+        Corners of the particle domains of all bodies; the last axis is vertical.
     unit_weight : (n,), N/m^3
         Unit weights of the domains.
     x : (m, d), m
@@ -51,11 +51,13 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
     ray, domain = near["i"], near["j"]
     inside = ((across[ray] >= low[domain]) & (across[ray] <= high[domain])).all(axis=1)
     ray, domain = ray[inside], domain[inside]
-    hits = [(ray[on], height, sign * unit_weight[domain[on]]) for on, height, sign in _hits(corners[domain], across[ray])]
+    hits = [
+        (ray[on], height, sign * unit_weight[domain[on]]) for on, height, sign in _hits(corners[domain], across[ray])
+    ]
     ray, height, weight = (np.concatenate(column) for column in zip(*hits, strict=True))
     surface = np.full(len(across), -np.inf)
     np.maximum.at(surface, ray, height)
-    # positions on one line share cumulative sums, sorted by line and height
+    # positions on the same vertical line share cumulative sums, sorted by line and height
     order = np.lexsort((height, ray))
     ray, height, weight = ray[order], height[order], weight[order]
     base, scale = x[:, -1].min(initial=np.inf), 1 + np.ptp(corners[..., -1])
