@@ -539,8 +539,7 @@ class Assembled(Keyed):
         if self.storage is not None:
             self.storage.set_alternation()
             if (form := storage.fluxes.nonorthogonal) is not None:
-                facets = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
-                self._off = facets if facets.some else None
+                self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
         self._gradients: Latest[Gradients] = Latest()
 
     @property
