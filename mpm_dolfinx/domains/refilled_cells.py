@@ -33,7 +33,7 @@ GAP = 0.01
 Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02 (relative changes of the result).
 """
 CRUMB = NEAR
-"""Area, as a fraction of the cell, below which a part is dropped.  Other parts receive its mass.  Source: as `NEAR`."""
+"""Area, as a fraction of the cell, below which a part is dropped; other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
 """Area limit, as a fraction of the cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
@@ -141,7 +141,7 @@ class RefilledCells:
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
         """Return cells that cannot be renewed.
 
-        These contain points that may not be renewed, several bodies, or faces with different conditions.
+        Such cells contain points that may not be renewed, several bodies, or faces with different conditions.
         """
         of, cell = self.pieces.point, self.cell
         parts = self.parts
