@@ -30,7 +30,7 @@ from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 THICK = np.sqrt(2)
@@ -99,10 +99,10 @@ class DrainedSides(Feeding):
     def placed(self, wet: Wet) -> SideFeeds:
         """Return the flow through the open sides in a substep, with pressures and inflows at its end."""
         if self.varies:
-            return SideFeeds(self._sides(wet), wet, self._grid, self._names, self._ponds)
+            return SideFeeds(self._sides(wet), wet, self._names, self._ponds)
         key = (wet.cut.key, wet.contents.key, wet.points)
         sides = self._constant(key, lambda: self._sides(wet), self._grid.comm)
-        return SideFeeds(sides, wet, self._grid, self._names, self._ponds)
+        return SideFeeds(sides, wet, self._names, self._ponds)
 
     def _sides(self, wet: Wet) -> OpenSides:
         grid, rows = self._grid, []
@@ -257,16 +257,14 @@ class SideFeeds(Feeds):
         Faces of the open sides.
     wet
         Data of the substep.
-    grid
-        Background grid.
     names, ponds
         Names of the conditions, and largest pond depths, m, or None without rain; in the order of `OpenSides.number`.
     """
 
-    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):
+    def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
         self._rains = tuple(depth is not None for depth in ponds)
         self._names, self._before = names, wet.outcome
-        self._contents, self._comm = wet.contents, grid.comm
+        self._contents, self._comm = wet.contents, wet.cut.grid.comm
         self._fallen = sides.rain
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)

@@ -53,16 +53,17 @@ from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
+from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.parts import OfParts, Parts
-from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
+from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
 """Fraction of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
 
-Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 5.2e-11, twice by 1.3e-10, finer cells by 1.5e-02.
 """
 
 
@@ -92,25 +93,17 @@ class StorageForms:
         Pore pressure of the cells, positive in compression.
     active
         Active part of the grid.
-    bulk
-        Bulk modulus of the fluid, Pa.
+    materials
+        Materials of the scene, and its fluid. With retention curves the pieces have the fields retention, lever, pores.
     weight : (d,), N/m^3
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
         Whether to use alpha as the derivative of the content by J_Delta, so that the Jacobian is symmetric.  The
         neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
-    flows
-        Whether any material is permeable; if not, there are no fluxes.
-    softens
-        Whether soil may be softer than in the elastic state.
-    conductivity
-        Conductivity laws, or None.
     feeding
         Sources and open sides of all stages.
     inertial : (d,), N/m^3
         Inertia force on the pore fluid, -rho_w a, as UFL; None without inertia.
-    retentions
-        Retention curves of the scene, or None.  With them the pieces have the fields retention, lever and pores.
     """
 
     def __init__(
@@ -119,22 +112,22 @@ class StorageForms:
         displacement: fem.Function,
         pressure: CellPressure,
         active: Active,
-        bulk: float,
+        materials: SceneMaterials,
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
-        flows: bool,
-        softens: bool,
-        conductivity: ConductivityAtPieces | None,
         feeding: Sequence[Feeding],
         inertial: ufl.core.expr.Expr | None = None,
-        retentions: Retentions | None = None,
     ):
         self.grid = pieces.grid
         self.p, self.p_n = pressure.now, pressure.start
         self.p_before = pressure.before
-        self.bulk = bulk
+        self.bulk = bulk = materials.fluid.bulk
+        retentions, laws = materials.retentions, materials.conductivity_laws
         Q = self.p.function_space
-        self.conductivity = conductivity
+        self.conductivity = None
+        """Conductivity laws, None without any."""
+        if laws:
+            self.conductivity = ConductivityAtPieces(materials.materials, laws, pieces, displacement, self.p_before)
         self._work = fem.Function(Q)
         self._sums = self._work.x.array
         q = ufl.TestFunction(Q)
@@ -160,9 +153,9 @@ class StorageForms:
         by_u = [pieces.biot * coupling * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
-        self.symmetric, self.softens = symmetric, softens
-        relative = Relative(pieces.grid, retentions) if self.retains and flows else None
-        self.fluxes = FluxForms(pieces.grid, active, weight, flows, self.p, bulk, inertial, relative)
+        self.symmetric, self.softens = symmetric, materials.evolves
+        relative = Relative(pieces.grid, retentions) if self.retains and materials.conducts else None
+        self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, self.p, bulk, inertial, relative)
         self.feeding = tuple(feeding)
         """Sources and open sides of all stages."""
 
@@ -663,10 +656,9 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1]; the result is the fixed-stress operator if 0.  For a smooth pressure,
-            B K^-1 B^T is beta V.  It is half of this (at nu = 0) for a pressure that alternates along one axis, and
-            zero for a checkerboard. beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) /
-            (4 d) [p][q] <= beta V.
+            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
+            pressure, beta V / 2 (at nu = 0) for one that alternates along one axis, and zero for a checkerboard.
+            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

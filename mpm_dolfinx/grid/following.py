@@ -56,8 +56,8 @@ def lines_at(
     return out
 
 
-def carried(lines: Sequence[NDArray[np.float64]], way: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return lines (n,), m, along each axis after the smallest cells have moved by a displacement `way` (d,), m.
+def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return lines (n,), m, along each axis after the smallest cells have moved by a displacement `shift` (d,), m.
 
     Edges between the smallest cells and a side are multiplied by the powers 1, 2 ... of a common factor, counted from
     the smallest cells.  They therefore grow from there as before, but faster or slower.
@@ -68,32 +68,32 @@ def carried(lines: Sequence[NDArray[np.float64]], way: NDArray[np.float64]) -> l
         Smallest cells that touch a side and move along its normal; cells that would become smaller than the smallest.
     """
     out = []
-    for letter, x, gone in zip("xyz", lines, way.tolist(), strict=False):
+    for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):
         width = np.diff(x)
         small = np.flatnonzero(width <= width.min() * (1 + SAME))
         first, last = small[0], small[-1] + 1
-        if gone == 0 or last - first == len(width):
+        if step == 0 or last - first == len(width):
             out.append(x)
             continue
-        low = _filled(width[:first][::-1], x[first] - x[0], gone, width.min(), letter)
-        high = _filled(width[last:], x[-1] - x[last], -gone, width.min(), letter)
-        small = x[first : last + 1] + gone
+        low = _filled(width[:first][::-1], x[first] - x[0], step, width.min(), letter)
+        high = _filled(width[last:], x[-1] - x[last], -step, width.min(), letter)
+        small = x[first : last + 1] + step
         new = np.concatenate([small[0] - np.cumsum(low)[::-1], small, small[-1] + np.cumsum(high)])
         new[0], new[-1] = x[0], x[-1]
         out.append(new)
     return out
 
 
-def _filled(width: NDArray[np.float64], room: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
+def _filled(width: NDArray[np.float64], length: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
     """Return edges (n,), m, from the smallest cells to a side, after the distance grows by `more`, m.
 
-    `width` are the edges before, `room` the distance before, `least` the smallest edge, m.
+    `width` are the edges before, `length` the distance before, `least` the smallest edge, m.
     """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):
         raise ValueError(f"{what}, but its cells begin at a side: lines must have larger cells on both sides")
     power = np.arange(1, len(width) + 1)
-    total = room + more
+    total = length + more
     if total < len(width) * least * (1 - SAME):
         allowed = f"must stay {len(width) * least:.3g} m away for {len(width)} cells, none smaller than its own"
         raise ValueError(f"{what}, its cells are {total:.3g} m from a side, {allowed}")

@@ -179,7 +179,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
     """Return the complete state in a file; raise ValueError if it does not fit the simulation."""
     now, dim = simulation.state, simulation.grid.dim
     wet, damaged = simulation.scene.fluid is not None, f"{file}: is cut short or damaged"
-    ids, total = simulation.scene.all_ids(now.stage.present), sum(map(len, simulation.bodies))
+    ids, total = simulation.scene.ids(now.stage.present), sum(map(len, simulation.bodies))
     try:
         points = _points(_part(arrays, "points/"), now.points, ids, total)
         stay = None
@@ -316,9 +316,9 @@ def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.floa
     if given is None:
         return None
     node, values = given["node"], np.concatenate([given["values"], np.zeros((1, grid.dim))])
-    here = _nodes(grid)
-    at = np.searchsorted(node, here)
-    found = np.append(node, -1)[at] == here
+    own_nodes = _nodes(grid)
+    at = np.searchsorted(node, own_nodes)
+    found = np.append(node, -1)[at] == own_nodes
     return values[np.where(found, at, len(node))].ravel()
 
 

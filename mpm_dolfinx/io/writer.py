@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tables import columns, components
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
-from mpm_dolfinx.contact.tool import Tool, gone
+from mpm_dolfinx.contact.tool import Tool, motion_by_forces
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
@@ -196,7 +196,9 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 def _write_tools(simulation: Simulation, file: Path) -> None:
     """Write the parts of the grid cells inside the tools, with number and force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
-    corners = [tool.drawn(grid, simulation.t, gone(simulation.state.outcome, name)) for name, tool in tools.items()]
+    corners = [
+        tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
+    ]
     forces = np.stack([simulation.tool_forces[name][: grid.dim] for name in tools])
     number = np.repeat(np.arange(len(tools)), [len(one) for one in corners])
     with replacing(file) as part:
