@@ -233,10 +233,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors (cells,), N, of forces in local cells, including this condition.
-
-        `of_cells` are the errors without it.
-        """
+        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` leave out this condition."""
         return of_cells
 
     @property

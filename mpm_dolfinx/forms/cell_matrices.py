@@ -159,10 +159,7 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, with unrolled local dofs; return the further integrals (cells, quantities).
-
-        Final assembly is left to the caller.
-        """
+        """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
         sums = self._sums(data)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
@@ -216,10 +213,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, with unrolled local dofs; return the further integrals (cells, quantities).
-
-        Final assembly is left to the caller.
-        """
+        """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
         live, filled = self._values.live(data), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
