@@ -221,9 +221,9 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the depth, m, by which a body penetrates the fill's domains, else the gap in cells; and the place.
+    """Return the penetration depth of a body into the fill's domains, m, the gap in cells, and the position (d,), m.
 
-    The result is (depth, gap, position); depth or gap is 0.
+    Depth or gap is zero.
     """
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
