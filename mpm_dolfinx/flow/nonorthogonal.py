@@ -201,9 +201,9 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def _off_middle(sides: OpenSides, off: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether the side of each face (m,), all faces of a condition in its cell, is not opposite the centroid.
+    """Return for each face (m,) whether the faces of its condition in its cell are offset from the cell's centroid.
 
-    off (m, d): vectors along the faces from the feet of the centroids, in cells.
+    `off` (m, d), in cells, are vectors along the faces from the foot of the centroid.  The faces' mean vector decides.
     """
     _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
     at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
