@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return names and values (n, ...) of the state at the end of a step; data contain F at the end; dt: s."""
+        """Return names and values (n, ...) of the state at the end of a step; data have F at the end; dt: step, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update

@@ -191,7 +191,7 @@ class Skeleton:
         drains = getattr(self.conductivity_law, "specific_yield", 0.0)
         if drains and self.retention is not None:
             raise ValueError(
-                f"{type(self).__name__}: retention beside a specific yield {drains:g}, must be one of them"
+                f"{type(self).__name__}: retention and a specific yield {drains:g}, must be only one of them"
             )
         _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):

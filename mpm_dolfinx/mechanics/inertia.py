@@ -83,9 +83,9 @@ def checked_velocity(
         return None
     flag("inertia", inertia)
     if quadrature != "domain":
-        raise ValueError(f"inertia = {inertia}: not with quadrature {quadrature!r}, must be left out")
+        raise ValueError(f"inertia = {inertia} with quadrature {quadrature!r}, must be None")
     if velocity is not None and not inertia:
-        raise ValueError(f"velocity = {line(velocity)}: bodies are at rest at first, must be given with inertia=True")
+        raise ValueError(f"velocity = {line(velocity)}: no inertia at first, must be given with inertia=True")
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
     elif grid.axisymmetric and velocity is not None and np.ravel(velocity)[:1].any():

@@ -29,7 +29,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
-"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` may have an open face. Source: epsilon."""
+"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
 TANGLED = 0.2  # volume between the corners / volume of the domain; below it corners are re-initialised from F
 

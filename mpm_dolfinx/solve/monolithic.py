@@ -20,7 +20,7 @@ Four steps of yielding soil, 12^3 cells, take 33 and 41 s. MUMPS factorises 3190
 (PETSc in 3.4 s). Solves then take at most 19 iterations, at nu = 0.49 with contrasts of 1e3 at most 22.
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
-wide, and coarse grids cannot represent them. With a viscosity of 0.05 it takes 28. Its time is 0.9 times that of a
+wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28. Its time is 0.9 times that of a
 direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage, p -> p + k B
 u, K is as at nu = 0.3, but alternating pressures have almost no stiffness: 500 iterations.
 """

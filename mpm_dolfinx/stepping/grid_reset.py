@@ -176,7 +176,6 @@ class OnGrid(Keyed):
         """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
 
         The mass potentials pi (m,), Pa, preserve linear fields; a constant for each point corrects their pressures.
-        water.
         """
         materials = self._quadrature.materials
         points = self.cut.points

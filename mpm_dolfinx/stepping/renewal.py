@@ -294,7 +294,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the points with kept (n,), together with new points."""
+    """Return the points for which kept (n,) is true, together with the new points `made`."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 

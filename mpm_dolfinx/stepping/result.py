@@ -201,7 +201,7 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """End of a run, because a step fails at any length.
+    """Error that ends a run: a step fails at any length.
 
     The simulation is in the state of the last good step. A new run may continue it with other conditions or steps.
 
