@@ -5,17 +5,17 @@ import house
 import pytest
 
 CEILINGS = {
-    "ad hoc named numbers": 105,
+    "ad hoc named numbers": 100,
     "rules among numbers in functions": 3,
-    "imports a file, mean": 5.63,
+    "imports a file, mean": 5.61,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 14,
-    "assignments of three and more values": 20,
-    "changes of hidden state": 9,
+    "assignments of three and more values": 19,
+    "changes of hidden state": 6,
     "files that name a condition's class, most": 6,
-    "lines of the package": 37060,
+    "lines of the package": 36930,
 }
 
 HALF = "half the value changes the result by"

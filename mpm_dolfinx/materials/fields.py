@@ -132,12 +132,12 @@ class SceneMaterials:
             values = {name: getattr(m, name) for name in self._fields[i]}
             count = sum(len(body) for body in bodies if body.material == i)
             self._add_shapes(_expanded(m, values, count), seeded, len(points))
-            here, rows = _rows(bodies, i, points.id)
+            found, rows = _rows(bodies, i, points.id)
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
                 self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
                 filled = np.zeros((len(points), *value.shape[1:]))
-                filled[here] = value[rows]
+                filled[found] = value[rows]
                 seeded[name] = filled + seeded[name] if name in seeded else filled
         seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
@@ -596,18 +596,18 @@ def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
 
 def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the indices (m,) of points with a material, and their rows in the result of `_places`."""
-    here = []
+    found = []
     rows = []
     start = 0
     before = 0
     for body in bodies:
         if body.material == material:
             of_body = ((ids >= start) & (ids < start + len(body))).nonzero()[0]
-            here.append(of_body)
+            found.append(of_body)
             rows.append(ids[of_body] - start + before)
             before += len(body)
         start += len(body)
-    return np.concatenate(here), np.concatenate(rows)
+    return np.concatenate(found), np.concatenate(rows)
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:

@@ -9,8 +9,7 @@ with errors of round-off.  The forms contain
 with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress with respect to y
 and F is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  If the
 stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.  Then y
-has a second-order term, whose coefficients also follow from f = 0.  A law may instead return y(z) and its derivative in
-numpy.
+has a second-order term, whose coefficients also follow from f = 0.  A law in numpy may instead return y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -327,8 +326,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return the failed points.
 
-    system: function of point indices (r,) and values (r, m).  It sets the values, and returns f (r, m), df/dy (r, m, m)
-    and norms of f (r,).
+    system: function of indices (r,) and values (r, m).  It sets the values, and returns f, df/dy and norms of f (r,).
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

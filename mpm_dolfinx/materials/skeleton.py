@@ -447,8 +447,7 @@ class unsaturated:
     The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
     is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
-    steps of about (cell size)^2 / (coefficient of consolidation), and a free surface must cross less than a cell a
-    step.
+    steps of about (cell size)^2 / (coefficient of consolidation), in which a free surface crosses less than a cell.
 
     Parameters
     ----------

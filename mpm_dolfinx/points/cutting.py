@@ -44,8 +44,7 @@ class Pieces:
     mixed (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2.
     hoop (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
     product of its components, m^2; radius of this centroid, m.
-    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for
-    pieces with symmetric sections.
+    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; of symmetric rings.
     """
 
     point: NDArray[np.int64]

@@ -48,18 +48,20 @@ class Probes:
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, of the probes on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, interpolate(points.corners[at] - points.origin[at], self.xi[here]))
+        known, at = points.find(self.id)
+        return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the present positions (m, d), m, of the probes on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
+        known, at = points.find(self.id)
+        return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
-    def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _shared(
+        self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return the values (m, ...) of all probes on every process; here, values: of the probes on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
-        out[here] = values
+        out[known] = values
         return over_all(comm, out)
 
 
@@ -91,8 +93,7 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
     """Return probes: material particles at which a run records results, for `probes` of `Simulation.run`.
 
-    A run records displacement and position, with fluid also the pore pressure, and on request the effective stress; see
-    `Row`.
+    A run records displacement and position, with fluid also the pore pressure, and on request the stress; see `Row`.
 
     Parameters
     ----------

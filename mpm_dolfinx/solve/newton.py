@@ -68,6 +68,7 @@ SUDDEN = np.sqrt(2)
 
 The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2). The changes there
 are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma if pressures follow loads.
+Source: exact, the ratio of these changes.
 """
 
 
@@ -237,7 +238,7 @@ class Newton:
         keep = self._solvers.plan.keep
         count = 0
         slow = False
-        went: NDArray[np.float64] | float = 0.0
+        log_change: NDArray[np.float64] | float = 0.0
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
             if found is not errors:  # converged, but contact forces or multipliers have changed
@@ -252,7 +253,7 @@ class Newton:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
             if self._storage is not None:
-                went = self._solvers.restrain(self._storage, went)
+                log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
             # infinite before any fluid has been exchanged
@@ -384,10 +385,8 @@ class Newton:
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
-            where, what = (
-                ("storage, from a source", size) if np.isfinite(r.norm()) else ("momentum, from a law or term", norm)
-            )
-            raise NotConverged(f"{what:g} in the residual of the {where}, must be finite")
+            where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
+            raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
         self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
@@ -445,8 +444,8 @@ class Newton:
         if (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
-        begun = Halving() if elastic else Search()
-        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], begun)
+        start = Halving() if elastic else Search()
+        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], start)
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)

@@ -538,8 +538,7 @@ class Assembled(Keyed):
         if self.storage is not None:
             self.storage.set_alternation()
             if (form := storage.fluxes.nonorthogonal) is not None:
-                facets = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
-                self._off = facets if facets.some else None
+                self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
         self._gradients: Latest[Gradients] = Latest()
 
     @property
@@ -647,7 +646,7 @@ def assembled(
 
     def make() -> System:
         if not stage.inertia and not any(one.holding for one in loads):
-            check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
+            check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
         return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
