@@ -385,8 +385,8 @@ class Newton:
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
-            where, what = ("storage: a source", size) if np.isfinite(r.norm()) else ("momentum: a law or term", norm)
-            raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
+            where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
+            raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
         self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
