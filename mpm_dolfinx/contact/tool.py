@@ -111,8 +111,6 @@ class Tool:
 
     Raises
     ------
-    Raises
-    ------
     ValueError
         An invalid value.  From a step: the tool starts inside a body, or touches a side with prescribed displacement.
     """
