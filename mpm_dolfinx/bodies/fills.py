@@ -134,8 +134,8 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
             if len(cover.face):
                 rows, pair = np.unique(around.row[cover.by], return_inverse=True)
                 now = np.zeros((len(rows), 2**grid.dim, grid.dim))
-                here, at = points.find(_start(bodies, other) + rows)
-                now[here] = points.corners[at]
+                known, at = points.find(_start(bodies, other) + rows)
+                now[known] = points.corners[at]
                 moved = over_all(grid.comm, now) - (bodies[other].corners(rows) - grid.base)
                 moved = moved[pair[:, None], around.index[cover.by]]
                 out.append(Contact((axis, end), own, around, cover, moved))

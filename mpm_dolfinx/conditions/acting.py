@@ -147,7 +147,7 @@ class Loads:
     key: Any = None
     """Key of everything on which the penalty depends, except for the positions of faces."""
 
-    def begun(self, shares: Shares, gone: Any) -> Loads:
+    def begun(self, shares: Shares, earlier: Any) -> Loads:
         """Return the loads for a substep with inertia.  `gone` is the result of `flown` in the previous substep."""
         return self
 

@@ -25,11 +25,6 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
     """Raise an error for invalid axisymmetric scenes.  Warn about narrow holes around the axis."""
     if grid.axisymmetric and quadrature == "point":
         raise ValueError("quadrature 'point': must be domain in axisymmetry")
-    _warn_narrow_hole(grid, bodies)
-
-
-def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Warn about a hole narrower than the first cells at the axis, because their nodes on the axis are fixed."""
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])
@@ -41,7 +36,7 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
     for k in range(3):  # an inclined surface leaves the axis in the next row of cells
         touches[row[inner[near] <= NEAR * h] + k] = True
     hole = near[~touches[row + 1]]
-    if len(hole):
+    if len(hole):  # nodes of the first cells lie on the axis, and are fixed
         k = hole[inner[hole].argmin()]
         what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves like "
         what += "that of a solid core; use smaller cells, or a grid that begins at a radius > 0"

@@ -70,6 +70,29 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
         )
 
 
+def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
+    """Warn of each water level whose unit weight differs from the pore fluid's.
+
+    In a dry scene warn of each level with the unit weight of water under another gravity.
+
+    Parameters
+    ----------
+    levels
+        Names and pressures of the levels.
+    """
+    g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
+    if fluid is None:
+        levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
+        own, of = 1000 * g, "water under the scene's gravity"
+    else:
+        own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
+    weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
+    for name, weight in sorted(weights):
+        if abs(weight - own) > WEIGHS * max(weight, own):
+            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
+            warn(comm, ConditionWarning, f"{what}: at one level they are not at rest", name, weight, of, own)
+
+
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
     """Return a constant gravity, m/s^2, that differs from the one with which conductivities are converted, else None.
 

@@ -31,21 +31,21 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 from mpm_dolfinx.conditions.acting import At, Shares
-from mpm_dolfinx.contact.problem import ContactProblem, Found, Gone, outer
+from mpm_dolfinx.contact.problem import ContactProblem, Found, SubstepMotion, outer
 from mpm_dolfinx.mechanics.inertia import Flight
 
 
-class Goes(NamedTuple):
+class FreeMotion(NamedTuple):
     """Linearised motion of free tools for contact pairs at relative displacements w, see the module."""
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
-    travel: NDArray[np.float64]  # motion of the tools at w (k, q), m and rad
+    motion: NDArray[np.float64]  # motion of the tools at w (k, q), m and rad
     shift: NDArray[np.float64]  # Newton increment of this motion (k, q), m and rad
     inverse: NDArray[np.float64]  # S^-1 (k, q, q); its product with further forces is added to the motion
     found: Found  # contact at w
 
 
-class Met(NamedTuple):
+class MotionEquation(NamedTuple):
     """Linearised equation of motion of free tools."""
 
     inverse: NDArray[np.float64]  # S^-1 (k, q, q)
@@ -62,7 +62,7 @@ class FreeTools(ContactProblem):
         Arguments of `ToolLoads`.
     mass, guides
         Masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  Projections (k, q, q) on
-        the motions that each tool can perform, see `ways_of`.
+        the motions that each tool can perform, see `motion_count`.
     velocity, pushes
         Velocities (k, q), m/s and rad/s, at the start of the step.  Loads (k, q), N and N m.
     """
@@ -78,20 +78,20 @@ class FreeTools(ContactProblem):
         """Velocities and accelerations (k, q) of the tools at the start of the substep, m/s, m/s^2, rad/s, rad/s^2."""
         self._rate, self._free = 0.0, np.zeros_like(velocity)
 
-    def begun(self, shares: Shares, gone: Gone | None) -> FreeTools:
+    def begun(self, shares: Shares, earlier: SubstepMotion | None) -> FreeTools:
         """See `Loads`."""
-        out = super().begun(shares, gone)
-        if gone is not None:
-            out.flight = gone.flight
+        out = super().begun(shares, earlier)
+        if earlier is not None:
+            out.flight = earlier.flight
         if shares.gravity is not None:
             pulls = np.zeros_like(self._pushes)
             pulls[:, : self.grid.dim] = shares.gravity
             out._pushes = self._pushes + np.einsum("kij,kj->ki", self._guides, self._mass * pulls)
         out._rate, out._free = shares.own**-2, out.flight.free(shares.own, shares.before)
-        out.now = self.now._replace(ways=out._goes(np.zeros_like(self.pairs.x), out._free))
+        out.now = self.now._replace(linear=out._free_motion(np.zeros_like(self.pairs.x), out._free))
         return out
 
-    def flown(self, at: At) -> Gone:
+    def flown(self, at: At) -> SubstepMotion:
         """See `Loads`."""
         return super().flown(at)._replace(flight=self._after(at))
 
@@ -110,17 +110,17 @@ class FreeTools(ContactProblem):
 
     def _after(self, at: At) -> Flight:
         """Return velocities and accelerations of the tools after the substep."""
-        acceleration = self._rate * (self.found(at).travel - self._free)
+        acceleration = self._rate * (self.found(at).motion - self._free)
         return self.flight.after(acceleration, self.shares.own, self.shares.before)
 
     def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._travel(w))
+        return self._find_at(w, self._motion(w))
 
-    def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
-        found = super()._find_at(w, way)
-        if way.ndim == 1:  # before the first substep
+    def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
+        found = super()._find_at(w, motion)
+        if motion.ndim == 1:  # before the first substep
             return found
-        return found._replace(balanced=found.touch.force + self._pulled(found, self._met(found).shift))
+        return found._replace(balanced=found.touch.force + self._pulled(found, self._equation(found).shift))
 
     def _moved(self, found: Found, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return A q (m, d), the displacements of contact positions caused by motions q (k, q) of the tools."""
@@ -146,26 +146,26 @@ class FreeTools(ContactProblem):
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
-    def _travel(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the motions (k, q) of the tools at w (m, d), m, from the last linearisation."""
-        goes = self.now.ways
+        last = self.now.linear
         law = self.now.law
-        dw = w - goes.w
-        moved = self._onto(goes.found, law.slope(goes.found.touch, goes.found.at, dw))
+        dw = w - last.w
+        moved = self._onto(last.found, law.slope(last.found.touch, last.found.at, dw))
         d = self.grid.dim
-        moved[:, d:] += (across(goes.found.touch.force) * dw).sum(axis=1, keepdims=True)[:, : d == 2]
+        moved[:, d:] += (across(last.found.touch.force) * dw).sum(axis=1, keepdims=True)[:, : d == 2]
         on = law.by_contact(np.column_stack([(dw != 0).any(axis=1), moved]))
         if not on[:, 0].any():
-            return goes.travel
-        return goes.travel + goes.shift + np.einsum("kij,kj->ki", goes.inverse, on[:, 1:])
+            return last.motion
+        return last.motion + last.shift + np.einsum("kij,kj->ki", last.inverse, on[:, 1:])
 
-    def _goes(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Goes:
-        """Return the linearised motion of the tools about the motions `travel` (k, q), for pairs at w (m, d), m."""
-        found = self._find_at(w, travel)
-        met = self._met(found)
-        return Goes(w, travel, met.shift, met.inverse, found)
+    def _free_motion(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> FreeMotion:
+        """Return the linearised motion of the tools about the motions `motion` (k, q), for pairs at w (m, d), m."""
+        found = self._find_at(w, motion)
+        equation = self._equation(found)
+        return FreeMotion(w, motion, equation.shift, equation.inverse, found)
 
-    def _met(self, found: Found) -> Met:
+    def _equation(self, found: Found) -> MotionEquation:
         """Return the linearised equation of motion of the tools, for a contact."""
         law = self.now.law
         d = self.grid.dim
@@ -182,18 +182,18 @@ class FreeTools(ContactProblem):
         if d == 2:  # the lever arm changes as the tool moves
             S[:, d, :d] += np.einsum("kij,ki->kj", self._guides[:, :d, :d], across(sums[:, :d, 0]))
         resists = self._rate * self._mass
-        back = resists * (found.travel - self._free)
+        inertial = resists * (found.motion - self._free)
         S = self._guides @ S + resists[:, None] * np.eye(len(motions))
         free = self._free_tools
         inverse = np.zeros_like(S)
         inverse[free] = self._guides[free] @ np.linalg.inv(S[free])
-        off = self._pushes - back - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
-        scale = np.maximum(np.abs([self._pushes, back]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
+        off = self._pushes - inertial - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
+        scale = np.maximum(np.abs([self._pushes, inertial]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
         scale[:, :d] = np.linalg.norm(scale[:, :d], axis=1, keepdims=True)
-        rounding = sums[:, :, 2] + ROUND_OFF * resists * (np.abs(found.travel) + np.abs(self._free))
+        rounding = sums[:, :, 2] + ROUND_OFF * resists * (np.abs(found.motion) + np.abs(self._free))
         scale = np.maximum(scale, rounding / SAME)
         share = (np.abs(off) / np.where(scale > 0, scale, 1.0)).max(axis=1)
-        return Met(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
+        return MotionEquation(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 
     def pattern(self, unknowns) -> PETSc.Mat | None:
         """See `Loads`: all nodes under a free tool are coupled."""
@@ -209,7 +209,7 @@ class FreeTools(ContactProblem):
         """See `Loads`."""
         K = super().coupling(at)
         found = self.found(at)
-        inverse = self._met(found).inverse
+        inverse = self._equation(found).inverse
         for k in np.flatnonzero(self._free_tools):
             on = (np.arange(len(inverse)) == k)[:, None]
             for e, to in zip(np.eye(inverse.shape[1]), inverse[k].T, strict=True):
@@ -221,9 +221,9 @@ class FreeTools(ContactProblem):
 
     def settle(self, at: At, sticks: bool) -> bool:
         """See `Loads`."""
-        w, travel = self._apart_by(self.now.law, at), self.found(at).travel
+        w, motion = self._apart_by(self.now.law, at), self.found(at).motion
         changed = super().settle(at, sticks)
-        self.now = self.now._replace(ways=self._goes(w, travel))
+        self.now = self.now._replace(linear=self._free_motion(w, motion))
         return changed
 
     def augment(self, at: At) -> bool:
@@ -231,26 +231,27 @@ class FreeTools(ContactProblem):
         if super().augment(at):
             return True
         found = self.found(at)
-        met = self._met(found)
-        if not (met.off > SAME).any():
+        equation = self._equation(found)
+        if not (equation.off > SAME).any():
             return False
-        self.now = self.now._replace(ways=self._goes(self._apart_by(self.now.law, at), found.travel + met.shift))
+        w = self._apart_by(self.now.law, at)
+        self.now = self.now._replace(linear=self._free_motion(w, found.motion + equation.shift))
         return True
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """See `Loads`.  Adds velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
         out = super().outcome(at)
         d, names = self.grid.dim, self.now.law.names
-        way, velocity = self.pushes.start + self.found(at).travel, self._after(at).velocity
-        turns = self._guides[:, -1, -1]
+        motion, velocity = self.pushes.start + self.found(at).motion, self._after(at).velocity
+        rotating = self._guides[:, -1, -1]
         out["tool_travel"] = {
-            name: way[k, :d] if self._free_tools[k] else np.array(0.0) for k, name in enumerate(names)
+            name: motion[k, :d] if self._free_tools[k] else np.array(0.0) for k, name in enumerate(names)
         }
         out["tool_velocity"] = {names[k]: velocity[k, :d] for k in np.flatnonzero(self._free_tools)}
-        if d == 2 and turns.any():
+        if d == 2 and rotating.any():
             out |= {
-                quantity: {names[k]: np.array(of[k, d]) for k in np.flatnonzero(turns)}
-                for quantity, of in (("tool_rotation", way), ("tool_spin", velocity))
+                quantity: {names[k]: np.array(of[k, d]) for k in np.flatnonzero(rotating)}
+                for quantity, of in (("tool_rotation", motion), ("tool_spin", velocity))
             }
         return out
 

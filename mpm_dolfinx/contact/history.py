@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -33,27 +33,11 @@ def shear_name(name: str) -> str:
     return f"{name}_shear"
 
 
-def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
-    """Return the points without the fields with these names."""
-    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
-
-
-def gripped(
-    points: MaterialPoints, new: Mapping[str, NDArray[np.float64]], before: MaterialPoints | None
-) -> MaterialPoints:
-    """Return the points with new fields.  Points that are also in `before` keep their earlier values."""
-    if before is not None:
-        here, at = before.find(points.id)
-        for name in new.keys() & before.data.keys():
-            new[name][here] = before.data[name][at]
-    return replace(points, data={**points.data, **new}) if new else points
-
-
 @dataclass(frozen=True, eq=False)
 class Origin:
     """Material points to which contact pairs belong; arrays (n,) before pairs are sent to the owners of cells."""
 
-    travel: Exchange  # sends the pairs to the owners of their cells
+    exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
     number: NDArray[np.int64]  # number of the contact (n,)
     area: NDArray[np.float64]  # contact area (n,), m^(d-1)
@@ -65,8 +49,8 @@ class Origin:
 
         `push` (m,) and `shear` (m, d), Pa, are the pressures and shear tractions of the pairs.
         """
-        push = self.travel.back(push)
-        shear = self.travel.back(shear)
+        push = self.exchange.back(push)
+        shear = self.exchange.back(shear)
         data = dict(points.data)
         n = len(points)
         for number, (name, contact) in enumerate(contacts.items()):

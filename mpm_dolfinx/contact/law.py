@@ -33,7 +33,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
@@ -45,7 +45,6 @@ STIFF = 100.0
 GRIP = 6.0
 """Stiffness k_t in units of (resistance) / (cell size).  If larger, shears may alternate without nodal forces."""
 DEPTH = 5e-4  # cells: allowed mean penetration
-TOUCH = 1e-13  # of the grid's largest coordinate: smaller gaps are contact; light bodies penetrate less than 1e-8 cells
 SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 SLOW, STIFFER = 0.6, 10.0
@@ -86,7 +85,7 @@ class Touch:
     shear: NDArray[np.float64]  # shear traction (k, d), Pa
     most: NDArray[np.float64]  # shear strength (k,), Pa
     grip: NDArray[np.float64]  # minus the derivative of the shear traction by slip (k, d, d), Pa/m
-    rise: NDArray[np.float64]  # derivative of the shear traction by the pressure (k, d)
+    by_pressure: NDArray[np.float64]  # derivative of the shear traction by the pressure (k, d)
 
 
 class ContactLaw:
@@ -142,7 +141,9 @@ class ContactLaw:
         """Return forces and derivatives for pairs with a geometry `at`."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
+        # only rounding: light bodies penetrate less than 1e-8 cells
+        rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
+        touches = (push > 0) | (at.gap <= rounding)
         pressure = self.mean(push)
         on = np.zeros(len(self.area), dtype=bool)
         normal = self.mean(at.n)
@@ -156,7 +157,7 @@ class ContactLaw:
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
     ) -> tuple:
-        """Return the fields of `Touch` from `sticks` to `rise`.
+        """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
         Means of the conditions (k, d): normals n, slips, m, and tractions before the step `old`, Pa.
         """
@@ -168,11 +169,11 @@ class ContactLaw:
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
         onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until updated
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
-        turns = hold * np.where(slips, onward * most / size, 1.0)
-        grip = turns[:, None, None] * (P - along[:, :, None] * along[:, None, :])
-        rise = (mu + RAMP * ramp)[:, None] * along
+        scale = hold * np.where(slips, onward * most / size, 1.0)
+        grip = scale[:, None, None] * (P - along[:, :, None] * along[:, None, :])
+        by_pressure = (mu + RAMP * ramp)[:, None] * along
         shear = np.where(slips[:, None], most[:, None] * along, trial)
-        return ~slips & on, trial, shear, most, grip, rise
+        return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
         """Return D (m d, m d): minus the derivative of the forces by w, without the rotation of shear tractions."""
@@ -193,10 +194,10 @@ class ContactLaw:
         k, whole = len(self.area), self.area[:, None, None]
         blocks = (np.arange(k), np.arange(k + 1))
         grip = scipy.sparse.bsr_matrix((whole * touch.grip, *blocks), shape=(k * d, k * d))
-        rise = scipy.sparse.bsr_matrix((whole * touch.rise[:, :, None], *blocks), shape=(k * d, k))
+        by_pressure = scipy.sparse.bsr_matrix((whole * touch.by_pressure[:, :, None], *blocks), shape=(k * d, k))
         pressed = (touch.stiff[:, None] * at.n)[:, None]
         slope = scipy.sparse.bsr_matrix((pressed, np.arange(m), np.arange(m + 1)), shape=(m, m * d))
-        return (D + wide.T @ (grip @ wide + rise @ (mean @ slope))).tocsr()
+        return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
         """Return D v (m, d) for v (m, d), or with `adjoint` the product with the transpose, see `tangent`."""
@@ -207,9 +208,9 @@ class ContactLaw:
         if self.grips:
             mean = self.mean(v)
             if adjoint:
-                out = out + touch.stiff[:, None] * at.n * (touch.rise * mean).sum(axis=1)[self.of, None]
+                out = out + touch.stiff[:, None] * at.n * (touch.by_pressure * mean).sum(axis=1)[self.of, None]
             else:
-                out = out + (touch.rise * self.mean(across))[self.of]
+                out = out + (touch.by_pressure * self.mean(across))[self.of]
             out = out + np.einsum("kji,kj->ki" if adjoint else "kij,kj->ki", touch.grip, mean)[self.of]
         return area * out
 
@@ -259,7 +260,7 @@ class ContactLaw:
     @property
     def rounding_of_gap(self) -> NDArray[np.float64] | float:
         """Rounding error of gaps, m: (m,) for each pair, or one value for all."""
-        return 4 * EPSILON * self.pairs.reach
+        return 4 * EPSILON * self.pairs.largest_coordinate
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""

@@ -97,20 +97,21 @@ class Contacts(Touching):
             signs.append(-1.0 if swap else 1.0)
         self._signs = np.array(signs)
         self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
-        self._reach: Latest[NDArray[np.int64]] = Latest()
+        self._cell_pairs: Latest[NDArray[np.int64]] = Latest()
 
     def placed(self, place: Place) -> Loads:
         """Return the loads by contact between groups in a substep."""
         cut, points = place.cut, place.points
-        found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
-        reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
+        found = self._found(cut.key, lambda: self._opposite_all(cut, cut.points), self.grid.comm)
+        cell_pairs = partial(self._cell_pairs, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
 
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
-            there = replace(points, corners=points.corners + moved)
-            return self._law(cut, points, self._met_all(cut, there), there, there, reach)
+            present = replace(points, corners=points.corners + moved)
+            return self._law(cut, points, self._opposite_all(cut, present), present, present, cell_pairs)
 
-        return ContactLoads(self, cut, *self._law(cut, points, found, cut.points, points, reach), again, reach)
+        first_law = self._law(cut, points, found, cut.points, points, cell_pairs)
+        return ContactLoads(self, cut, *first_law, again, cell_pairs)
 
     def _law(
         self,
@@ -118,10 +119,10 @@ class Contacts(Touching):
         points: MaterialPoints,
         found: Sequence[tuple[Facets, Pairs]],
         seen: MaterialPoints,
-        there: MaterialPoints,
-        reach: Callable[[], NDArray[np.int64]],
+        present: MaterialPoints,
+        cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `there`.
+        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `present`.
 
         `points` are the points at the start of the step, with the contact history.
         """
@@ -132,18 +133,18 @@ class Contacts(Touching):
         own = self._materials.table(cut.points, resistance)
         for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
-            now = facets if there is seen else self._facets(cut, others, there)
+            now = facets if present is seen else self._facets(cut, others, present)
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
-            if there is not points:
-                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, reach())
-                slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(there)[pairs.row])].all()
+            if present is not points:
+                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, cell_pairs())
+                slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(present)[pairs.row])].all()
                 off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
                 pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
             row = pairs.row
             other = pairs.facet
             at = patches.at[pairs.row]
             y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
-            area = patches.area(there)[row]
+            area = patches.area(present)[row]
             size = np.linalg.norm(area, axis=1)
             n = -patches.area(seen)[row]
             n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -151,27 +152,27 @@ class Contacts(Touching):
             if self.contacts[number].grips:
                 old = _turned(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
-            resists = np.minimum(own[at], now.resistance[other])
+            resistances = np.minimum(own[at], now.resistance[other])
             place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
-            scalars = np.stack([np.full(len(row), number), place, size, resists, pressure], axis=1)
-            apart = patches.now(there)[row] - y
-            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
+            scalars = np.stack([np.full(len(row), number), place, size, resistances, pressure], axis=1)
+            offset = patches.now(present)[row] - y
+            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, offset, old])))
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
-        travel = Exchange(grid.comm, grid.owner(cell))
-        cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
+        exchange = Exchange(grid.comm, grid.owner(cell))
+        cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, place = sent[:, :2].T.astype(np.int64)
-        x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
+        x, y, n, offset, shear = np.split(sent[:, 5:], 5, axis=1)
         own = number, grid.local(cell), *sent[:, 2:5].T, shear, x, self._signs
-        pairs = FacePairs(grid, *own, other, y, n, apart, place)
+        pairs = FacePairs(grid, *own, other, y, n, offset, place)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
-            travel, at, values[:, 0].astype(np.int64), values[:, 2]
+            exchange, at, values[:, 0].astype(np.int64), values[:, 2]
         )
 
-    def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
-        """Return the facets and pairs of each contact, see `_met`."""
-        return [self._met(cut, *faces, points) for faces in self._faces]
+    def _opposite_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
+        """Return the facets and pairs of each contact, see `_opposite`."""
+        return [self._opposite(cut, *faces, points) for faces in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
         """Return all pairs of cells (m,), as number first * cells + second, that contact pairs may occupy in the step.
@@ -201,19 +202,21 @@ class Contacts(Touching):
         now, then = (
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
         )
-        resists = self._materials.table(cut.points, resistance)[patches.at]
+        resistances = self._materials.table(cut.points, resistance)[patches.at]
         area = patches.area(points)
         n = len(now)
         k = 2 ** (d - 1) * d
         outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         whole = np.column_stack([patches.face, patches.cell])
-        rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
+        rows = np.column_stack([patches.now(points), resistances, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
-        x, resists, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
+        x, resistances, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
         shape = (len(rows), 2 ** (d - 1), d)
-        return Facets(x, *whole.T, resists[:, 0], now.reshape(shape), then.reshape(shape), outward)
+        return Facets(x, *whole.T, resistances[:, 0], now.reshape(shape), then.reshape(shape), outward)
 
-    def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
+    def _opposite(
+        self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
+    ) -> tuple[Facets, Pairs]:
         """Return the facets of the other group, and the pairs of points on `faces` with these facets."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
@@ -224,19 +227,19 @@ class Contacts(Touching):
         if not count:  # no body of the other group is active
             none = np.zeros(0, dtype=np.int64)
             return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
-        reach = REACH * (self.grid.least if self.grid.even else self.grid.most) + self.grid.most
-        _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
+        largest = REACH * (self.grid.least if self.grid.even else self.grid.most) + self.grid.most
+        _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=largest)
         row, column = np.nonzero(near < len(facets.x))
         other = near[row, column]
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
         h = self._sizes(x[row])
-        met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * h) & (gap >= -DEEP * h)
-        row = row[met]
-        other = other[met]
-        t = t[met]
-        gap = gap[met]
+        valid = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * h) & (gap >= -DEEP * h)
+        row = row[valid]
+        other = other[valid]
+        t = t[valid]
+        gap = gap[valid]
         order = np.lexsort((np.abs(gap), row))
         order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]
         return facets, Pairs(row[order], other[order], t[order], gap[order])
@@ -256,14 +259,14 @@ class Contacts(Touching):
 
         `points` are the points at the start of the step.
         """
-        out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
-        reach = np.broadcast_to(reach, corners.shape[:2])
+        out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
+        largest = np.broadcast_to(largest, corners.shape[:2])
         for pair in self._faces:
             for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, points).x
-                mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
-                distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=BESIDE * self.grid.most)
-                out[mine] |= distance < reach[mine]
+                rows = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
+                distance, _ = cKDTree(x).query(corners[rows], distance_upper_bound=BESIDE * self.grid.most)
+                out[rows] |= distance < largest[rows]
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
@@ -299,7 +302,7 @@ class Contacts(Touching):
         """Return a message with depth and position of an overlap of groups, or "" if none overlap."""
         h, comm = self.grid.least, self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
-            _, pairs = self._met(cut, faces, others, points)
+            _, pairs = self._opposite(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
@@ -315,12 +318,12 @@ class ContactLoads(ContactProblem):
     ----------
     contacts, cut
         Contacts, and cut particle domains.
-    law, origin, again, reach
+    law, origin, again, cell_pairs
         See `ContactProblem`.
     """
 
-    def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, reach):
-        super().__init__(law, origin, again=again, reach=reach)
+    def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
+        super().__init__(law, origin, again=again, cell_pairs=cell_pairs)
         self._contacts, self._cut = contacts, cut
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:

@@ -52,16 +52,16 @@ class Pairs:
     x: NDArray[np.float64]  # position of the point in the undeformed grid (m, d), m
     sign: NDArray[np.float64]  # sign of the forces on points in the results (contacts,)
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at w (m, d), m.
 
-        `travel` (contacts,), m, are displacements of tools by loads in the step.  With free tools its shape is
+        `motion` (contacts,), m, are displacements of tools by loads in the step.  With free tools its shape is
         (contacts, q): displacements, m, and rotations, rad.
         """
         raise NotImplementedError
 
     @property
-    def reach(self) -> NDArray[np.float64] | float:
+    def largest_coordinate(self) -> NDArray[np.float64] | float:
         """Largest coordinate in the computation of gaps, m: (m,) for each pair, or one value for all."""
         return self.grid.reach
 
@@ -86,7 +86,7 @@ class ToolPairs(Pairs):
     now: NDArray[np.float64]  # position of the point at the start of the step (m, d), m
     carried: NDArray[np.float64]  # this position after the motion of the tool (m, d), m
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
         d = self.grid.dim
         m = len(w)
@@ -95,15 +95,15 @@ class ToolPairs(Pairs):
         n = np.zeros((m, d))
         second = np.zeros((m, d, d))
         middle = np.zeros((m, d))
-        gone = travel if travel.ndim > 1 else travel[:, None] * [tool.along(d) for tool in self.tools]
+        shift = motion if motion.ndim > 1 else motion[:, None] * [tool.along(d) for tool in self.tools]
         x = self.now + w
-        carried = self.carried + gone[self.number, :d]
+        carried = self.carried + shift[self.number, :d]
         shear = self.shear.copy()
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
                 solid, rows = tool.solid(h), np.flatnonzero(self.number == number)
-                before, pose = pose, pose.gone(gone[number])
+                before, pose = pose, pose.moved(shift[number])
                 if pose.R is not before.R:
                     turn = pose.R @ before.R.T
                     carried[rows] = pose.put(before.own(self.carried[rows]))
@@ -118,7 +118,7 @@ class ToolPairs(Pairs):
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
-    def reach(self) -> NDArray[np.float64]:
+    def largest_coordinate(self) -> NDArray[np.float64]:
         """See `Pairs`.  User functions are evaluated at true positions, whose size decides the rounding error."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
@@ -131,12 +131,12 @@ class FacePairs(Pairs):
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
     n: NDArray[np.float64]  # outward unit normal of the other side there (m, d)
-    apart: NDArray[np.float64]  # vector from there to the point, without the displacement in the step (m, d), m
+    offset: NDArray[np.float64]  # vector from there to the point, without the displacement in the step (m, d), m
     place: NDArray[np.int64]  # number of the point, the same in all updates of the pairs in a step (m,)
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`.  Moments refer to the positions at the start of the step."""
-        gap = np.einsum("md,md->m", self.n, self.apart + w)
+        gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -166,9 +166,9 @@ def at_nodes(
     numbers = unknowns.map.indices.reshape(-1, d)
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
-        travel = Exchange(grid.comm, grid.owner(other))
-        there = travel.back(numbers[grid.cell_nodes[grid.local(travel.send(other))]])
-        column = np.concatenate([column, there], axis=1)
+        exchange = Exchange(grid.comm, grid.owner(other))
+        columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
+        column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)
     value, m = np.broadcast_to(value[:, None], (len(value), d, value.shape[1])), len(cell) * d
     row = np.broadcast_to(np.arange(m).reshape(-1, d, 1), column.shape)

@@ -53,14 +53,14 @@ class Pushes:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class LinearMotion:
     """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-    They are way + shift + sum slope . (w' - w), with the sum over the pairs of a tool.  Newton's method uses this line.
+    They are motion + shift + sum slope . (w' - w), with the sum over the pairs of a tool.  Newton's method uses them.
     """
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
-    way: NDArray[np.float64]  # displacements of the tools at w (k,), m
+    motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
     shift: NDArray[np.float64]  # Newton increment of these displacements (k,), m
     slope: NDArray[np.float64]  # derivative by the relative displacements of each pair (m, d)
 
@@ -70,7 +70,7 @@ class Found(NamedTuple):
 
     at: Geometry  # geometry of the pairs
     touch: Touch  # forces of the pairs
-    travel: NDArray[np.float64]  # displacements of tools by loads (k,), m
+    motion: NDArray[np.float64]  # displacements of tools by loads (k,), m
     balanced: NDArray[np.float64]  # forces on points after the Newton increment of the tools (m, d), N
 
 
@@ -80,10 +80,10 @@ class Current(NamedTuple):
     law: ContactLaw
     origin: Origin
     state: ContactState
-    ways: Ways | None = None
+    linear: LinearMotion | None = None
 
 
-class Gone(NamedTuple):
+class SubstepMotion(NamedTuple):
     """Motion of tools in a substep with time weight `own`, s: their poses, and the `Flight` of free tools."""
 
     own: float
@@ -109,7 +109,7 @@ class Touching(Acting):
         self.symmetric = not any(self._grips)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero histories of points: pressures (n,), Pa, and tractions (n, d), Pa, if a contact resists slip."""
+        """Return zero histories of n points: pressures (n,), Pa, and tractions (n, d), Pa, if contacts resist slip."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, grips in zip(self.names, self._grips, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
@@ -132,7 +132,7 @@ class ContactProblem(Loads):
         Loads of tools.
     again
         Function from displacements, a local array, m, to law and origin of the pairs there, see `FacePairs`.
-    reach
+    cell_pairs
         Function that returns all pairs of lexicographic cells of this process's pairs, as first * cells + second.
     """
 
@@ -144,17 +144,17 @@ class ContactProblem(Loads):
         origin: Origin,
         pushes: Pushes | None = None,
         again: Callable[[NDArray[np.float64]], tuple[ContactLaw, Origin]] | None = None,
-        reach: Callable[[], NDArray[np.int64]] | None = None,
+        cell_pairs: Callable[[], NDArray[np.int64]] | None = None,
     ):
         self.grid = law.grid
         self.pushes = pushes
         self._again = again
-        self._reach = reach
+        self._cell_pairs = cell_pairs
         self.now = Current(law, origin, law.begins())
         self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
         self._found: Latest[Found] = Latest()
         if self.pushed:
-            self.now = self.now._replace(ways=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
+            self.now = self.now._replace(linear=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
 
     @property
     def pairs(self) -> Pairs:
@@ -169,7 +169,7 @@ class ContactProblem(Loads):
     @property
     def couples(self) -> bool:
         """Whether the contact couples nodes of different cells."""
-        return self.pushed or self._reach is not None
+        return self.pushed or self._cell_pairs is not None
 
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
@@ -192,15 +192,15 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._way(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
+        return self._find_at(w, self._motion(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
 
-    def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
+    def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         law = self.now.law
         state = self.now.state
         of = self.pairs.number
-        at = law.pairs.at(w, way)
+        at = law.pairs.at(w, motion)
         touch = law.touch(state, at)
-        found = Found(at, touch, way, touch.force)
+        found = Found(at, touch, motion, touch.force)
         if not self.pushed:
             return found
         more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
@@ -215,7 +215,7 @@ class ContactProblem(Loads):
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
-        out = self._pattern_of_pairs(unknowns) if self._reach is not None else None
+        out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
         for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
             more = outer(own, own)
@@ -227,9 +227,9 @@ class ContactProblem(Loads):
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
-        cell, other = np.divmod(self._reach(), len(grid.owners))
-        travel = Exchange(grid.comm, grid.owner(cell))
-        cell, other = travel.send(cell), travel.send(other)
+        cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
+        exchange = Exchange(grid.comm, grid.owner(cell))
+        cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
         together = scipy.sparse.identity(m)
@@ -251,7 +251,7 @@ class ContactProblem(Loads):
         K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
         if not self.pushed:
             return K
-        _, slope, _ = self._met(found)
+        _, slope, _ = self._reactions(found)
         for k in np.flatnonzero((slope > 0) & ~np.isnan(self.pushes.load)):
             e = self.pushes.direction[k] * (self.pairs.number == k)[:, None]
             sides = (self._nodal(unknowns, law.slope(touch, where, e, adjoint)) for adjoint in (False, True))
@@ -266,30 +266,32 @@ class ContactProblem(Loads):
         B.multTranspose(w, out)
         return out
 
-    def _way(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (tools,), m, of tools by loads at w (m, d), m, from the last linearisation."""
-        ways, h = self.now.ways, self.grid.least
-        if not over_all(self.grid.comm, int((w != ways.w).any())):
-            return ways.way
-        more = self.now.law.by_contact((ways.slope * (w - ways.w)).sum(axis=1)[:, None])[:, 0]
-        return np.clip(ways.way + ways.shift + more, -h, h)
+        linear, h = self.now.linear, self.grid.least
+        if not over_all(self.grid.comm, int((w != linear.w).any())):
+            return linear.motion
+        more = self.now.law.by_contact((linear.slope * (w - linear.w)).sum(axis=1)[:, None])[:, 0]
+        return np.clip(linear.motion + linear.shift + more, -h, h)
 
-    def _linearised(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Ways:
-        """Return the displacements of tools, linearised about `way` (tools,), m, for pairs at w (m, d), m."""
+    def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
+        """Return the displacements of tools, linearised about `motion` (tools,), m, for pairs at w (m, d), m."""
         law, of = self.now.law, self.pairs.number
-        at, touch, *_ = found = self._find_at(w, way)
-        _, slope, _ = self._met(found)
+        at, touch, *_ = found = self._find_at(w, motion)
+        _, slope, _ = self._reactions(found)
         by = np.divide(1, slope, out=np.zeros(len(slope)), where=slope > 0)
         shift = self._shift(found)
-        return Ways(w, way, shift, by[of, None] * law.slope(touch, at, self.pushes.direction[of], adjoint=True))
+        slope = law.slope(touch, at, self.pushes.direction[of], adjoint=True)
+        return LinearMotion(w, motion, shift, by[of, None] * slope)
 
-    def _met(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _reactions(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the reactions along the loads (tools,), N, their derivatives, N/m, and their rounding errors, N."""
         law, e = self.now.law, self.pushes.direction[self.pairs.number]
         slope = law.slope(found.touch, found.at, e)
-        met, slope = law.by_contact(np.stack([(e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)], axis=1)).T
+        both = (e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)
+        reaction, slope = law.by_contact(np.stack(both, axis=1)).T
         off = law.rounding(self.now.state) * (found.touch.stiff > 0)
-        return met, slope, law.by_contact(off[:, None])[:, 0]
+        return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return the displacements (tools,), m, at which one contact point would carry the load, and which tools touch.
@@ -310,33 +312,33 @@ class ContactProblem(Loads):
 
     def _shift(self, found: Found) -> NDArray[np.float64]:
         """Return the Newton increments (tools,), m, with which reactions approach the loads."""
-        met, slope, _ = self._met(found)
-        off = np.nan_to_num(self.pushes.load - met)
+        reaction, slope, _ = self._reactions(found)
+        off = np.nan_to_num(self.pushes.load - reaction)
         far, touches = self._seek(found)
         seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # slip alone has no stiffness
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
         """Return initial displacements (tools,), m, for fixed bodies, at most until one point carries the load."""
-        way = np.zeros(len(self.now.law.contacts))
+        motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
         for _ in range(ROUNDS):
-            found = self._find_at(still, way)
-            before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
-            if np.abs(way - before).max() <= EPSILON * self.grid.reach:
+            found = self._find_at(still, motion)
+            before, motion = motion, np.clip(motion + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
+            if np.abs(motion - before).max() <= EPSILON * self.grid.reach:
                 break
-        return way
+        return motion
 
     def settle(self, at: At, sticks: bool) -> bool:
         """See `Loads`.  The slipping set consists of the conditions that slip."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
-        way = self.found(at).travel
+        motion = self.found(at).motion
         if self.now.law.grips:
             state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
             self.now = self.now._replace(state=state)
         if self.pushed:
-            self.now = self.now._replace(ways=self._linearised(w, way))
+            self.now = self.now._replace(linear=self._linearised(w, motion))
         return changed
 
     def augment(self, at: At) -> bool:
@@ -351,21 +353,22 @@ class ContactProblem(Loads):
         self.now = self.now._replace(state=new)
         if new is not state or not self.pushed:
             return new is not state
-        met, slope, unknown = self._met(found)
+        reaction, slope, unknown = self._reactions(found)
         load, h = self.pushes.load, self.grid.least
-        off = np.nan_to_num(met - load)
+        off = np.nan_to_num(reaction - load)
         wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
         if not wrong.any():
             return False
         _, touches = self._seek(found)
-        lost = wrong & ((found.travel >= h) | (touches & (slope <= 0)))
-        for k in np.flatnonzero(lost)[:1]:
-            why = f"the reaction is {met[k]:.6g} N for any displacement: do the bodies constrain it?"
-            if met[k] == 0:
+        failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
+        for k in np.flatnonzero(failed)[:1]:
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain it?"
+            if reaction[k] == 0:
                 why = "there is no contact within a cell: does it begin at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
-        ways = self.now.ways
-        self.now = self.now._replace(ways=self._linearised(ways.w, np.clip(ways.way + ways.shift * wrong, -h, h)))
+        linear = self.now.linear
+        motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
+        self.now = self.now._replace(linear=self._linearised(linear.w, motion))
         return True
 
     def follow(self, at: At) -> bool:
@@ -388,21 +391,21 @@ class ContactProblem(Loads):
         law = self.now.law
         state = self.now.state
         pairs = new.law.pairs
-        gap = np.einsum("md,md->m", pairs.n, pairs.apart)
-        pairs = replace(pairs, apart=pairs.apart - self._apart_by(new.law, at))
+        gap = np.einsum("md,md->m", pairs.n, pairs.offset)
+        pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
         now = ContactLaw(law.names, law.contacts, pairs)
         fresh = now.begins()
-        _, here, there = np.intersect1d(now.key, law.key, return_indices=True)
+        _, new_at, old_at = np.intersect1d(now.key, law.key, return_indices=True)
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
-            values[here] = getattr(state, name)[there]
+            values[new_at] = getattr(state, name)[old_at]
         fresh = replace(fresh, **carried, raised=state.raised, follows=state.follows + 1)
-        _, row, there = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
+        _, row, old_at = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
         push = found.touch.push
-        off, lost = np.maximum(-gap, 0.0), push > 0
-        off[row] = np.where((push[there] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[there]), 0.0)
-        lost[there] = False
-        most = float(off.max(initial=0.0)) / self.grid.least if not lost.any() else np.inf
+        off, missing = np.maximum(-gap, 0.0), push > 0
+        off[row] = np.where((push[old_at] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[old_at]), 0.0)
+        missing[old_at] = False
+        most = float(off.max(initial=0.0)) / self.grid.least if not missing.any() else np.inf
         return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
@@ -419,9 +422,9 @@ class ContactProblem(Loads):
         """
         law = self.now.law
         found = self.found(at)
-        B, apart = self._B(law, at.unknowns)
-        B.mult(at.unknowns.gather_owned(v[at.unknowns.owned]), apart)
-        moves = apart.array_r.reshape(-1, self.grid.dim)
+        B, relative = self._B(law, at.unknowns)
+        B.mult(at.unknowns.gather_owned(v[at.unknowns.owned]), relative)
+        moves = relative.array_r.reshape(-1, self.grid.dim)
         tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
         shear = law.pairs.area[:, None] * found.touch.shear[law.of]
         # `push` has counted the power of the tools as a part of the nodes' power
@@ -434,11 +437,11 @@ class ContactProblem(Loads):
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """See `Loads`: forces and moments on the bodies, (3,) or in 3D (6,), N, N m, and displacements by loads, m."""
-        where, touch, travel, _ = self.found(at)
+        where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
         if self.pushes is not None:
-            out["tool_travel"] = dict(zip(names, self.pushes.start + travel, strict=True))
+            out["tool_travel"] = dict(zip(names, self.pushes.start + motion, strict=True))
         return out
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SECOND, TINY
+from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SAME, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-ROUNDED = 1e-9  # cells: a position penetrating less than this lies on the surface
+ROUNDED = SAME  # cells: a position penetrating less than this lies on the surface
 DISTANCE = 0.1
 """Largest deviation of the slope of a user's distance function from 1."""
 

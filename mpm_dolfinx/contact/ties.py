@@ -30,21 +30,21 @@ from mpm_dolfinx.grid.grid import Grid
 class Tie:
     """Two opposite tied sides, and the faces at equal heights.
 
-    `partner` (m,) is the face of the other side for each face of one side.  `way` (m, d), m, is the vector between both
-    faces.  `axis` is the axis normal to them.
+    `partner` (m,) is the face of the other side for each face of one side.  `offset` (m, d), m, is the vector between
+    both faces.  `axis` is the axis normal to them.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
         self.one, self.other = one, other
         self.axis = int(one.face[0]) // 2
-        at, there = one.places().mean(axis=1), other.places().mean(axis=1)
+        at, opposite = one.places().mean(axis=1), other.places().mean(axis=1)
         along = np.arange(at.shape[1]) != self.axis
-        off, self.partner = cKDTree(there[:, along]).query(at[:, along])
+        off, self.partner = cKDTree(opposite[:, along]).query(at[:, along])
         alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
         small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
         if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
             raise ValueError(f"{line(tied)}: sides, must be opposite sides of a box with equal faces")
-        self.way = there[self.partner] - at
+        self.offset = opposite[self.partner] - at
 
 
 class Ties(Acting):
@@ -80,14 +80,14 @@ class Ties(Acting):
         modulus = self._materials.table(points, holding)
         for tie in self._ties:
             p = place.cut.surface(tie.one)
-            here, at = points.find(tie.other.id)
+            present, at = points.find(tie.other.id)
             moved = np.zeros((len(tie.other), 2**d, d))
-            moved[here] = points.corners[at] - points.origin[at]
+            moved[present] = points.corners[at] - points.origin[at]
             moved = grid.comm.allreduce(moved)
             across = p.xi * np.where(np.arange(d) == tie.axis, -1.0, 1.0)
             gap = p.now(points) - p.origin(points) - interpolate(moved[tie.partner[p.face]], across)
-            y = p.x + tie.way[p.face]
-            inside = y - NEAR * np.sign(tie.way[p.face, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
+            y = p.x + tie.offset[p.face]
+            inside = y - NEAR * np.sign(tie.offset[p.face, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
             other = grid.number(grid.index_from_base(inside)) + p.cell // grid.cells * grid.cells
             area = np.linalg.norm(p.area(points), axis=1)
             stiffness = HOLD * modulus[p.at] * area / grid.sizes_at(p.x).min(axis=-1)

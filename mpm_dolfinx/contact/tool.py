@@ -45,23 +45,23 @@ class Pose(NamedTuple):
         """Return the current positions of positions y (m, d) in the frame of the tool."""
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
-    def gone(self, way: NDArray[np.float64]) -> Pose:
-        """Return the pose after a further displacement, m, and, if `way` contains it, a rotation, rad."""
+    def moved(self, by_forces: NDArray[np.float64]) -> Pose:
+        """Return the pose after a further displacement, m, and, if `by_forces` contains it, a rotation, rad."""
         d = len(self.R)
-        R = turned(way[d]) @ self.R if way[d:].any() else self.R
-        return Pose(R, self.centre, self.shift + way[:d])
+        R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
+        return Pose(R, self.centre, self.shift + by_forces[:d])
 
 
-def turned(angle: float) -> NDArray[np.float64]:
+def rotation(angle: float) -> NDArray[np.float64]:
     """Return the matrix (2, 2) of a rotation by an angle, rad."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def gone(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
+def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
     """Return the displacement of a tool by forces, m, from an outcome, followed by its rotation by forces, rad."""
-    rotation = outcome.get("tool_rotation", {})
-    way = outcome["tool_travel"][name]
-    return np.append(way, rotation[name]) if name in rotation else way
+    angle = outcome.get("tool_rotation", {})
+    by_forces = outcome["tool_travel"][name]
+    return np.append(by_forces, angle[name]) if name in angle else by_forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ class Tool:
         of = self._uniform(dim)
         return np.inf if of is None or self.direction is not None else self.mass * of.gyration
 
-    def turns(self, dim: int) -> bool:
+    def rotates(self, dim: int) -> bool:
         """Whether forces rotate the tool."""
         return self.free and np.isfinite(self.inertia(dim))
 
@@ -254,12 +254,12 @@ class Tool:
 
     def _check_turns(self, dim: int) -> None:
         """Raise an error for invalid rotation of a free tool."""
-        of, turns = self._uniform(dim), self.turns(dim)
-        if dim == 3 and turns:
+        of, rotates = self._uniform(dim), self.rotates(dim)
+        if dim == 3 and rotates:
             raise ValueError(f"{line(self)}: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")
-        if self.spin and not turns:
+        if self.spin and not rotates:
             raise ValueError(f"{line(self)}: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
-        if not turns:
+        if not rotates:
             return
         if self.centre is None and of is None:
             raise ValueError(f"{line(self)}: moment, must be given with the centre of this shape")
@@ -272,27 +272,27 @@ class Tool:
             return (np.zeros(dim) if of is None else of.centroid) - self._base
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
-    def pose(self, t: float, dim: int, way: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at time t (s), after an additional displacement `way`, m, caused by the applied load.
+    def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
+        """Return the pose at time t (s), after an additional displacement `by_forces`, m, caused by the applied load.
 
-        For a free tool, `way` is a vector, followed by the rotation, rad.
+        For a free tool, `by_forces` is a vector, followed by the rotation, rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
         R, angle = np.eye(dim), float(self._given("rotation_rad", t))
         if angle:
-            R = turned(angle)
-        gone = way if np.ndim(way) else way * self.along(dim)
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).gone(gone)
+            R = rotation(angle)
+        shift_by_forces = by_forces if np.ndim(by_forces) else by_forces * self.along(dim)
+        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).moved(shift_by_forces)
 
-    def drawn(self, grid: Grid, t: float, way: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+    def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid cells inside the tool at time t (s), for pictures.
 
-        `way` is the displacement by forces, m, see `pose`.  Corners outside the tool are projected onto its surface, so
-        edges are blunt by a fraction of a cell.
+        `by_forces` is the displacement by forces, m, see `pose`.  Corners outside the tool are projected onto its
+        surface, so edges are blunt by a fraction of a cell.
         """
-        pose = self.pose(t, grid.dim, way)
+        pose = self.pose(t, grid.dim, by_forces)
         solid = self.solid(grid.least)
         nodes = tuple(grid.shape + 1)
         y = pose.own(grid.base + grid.places(np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1)))

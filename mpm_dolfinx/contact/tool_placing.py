@@ -27,8 +27,8 @@ from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
-from mpm_dolfinx.contact.problem import ContactProblem, Gone, Pushes, Touching
-from mpm_dolfinx.contact.tool import Pose, Tool, turned
+from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
+from mpm_dolfinx.contact.tool import Pose, Tool, rotation
 from mpm_dolfinx.mechanics.given_displacements import held_faces
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
@@ -45,12 +45,12 @@ def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
-def ways_of(dim: int) -> int:
+def motion_count(dim: int) -> int:
     """Return the number q of motions of a free tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
 
 
-class Ways(NamedTuple):
+class LoadMotion(NamedTuple):
     """Displacements of tools by loads, m, at the start and end of a step; with free tools (k, q), with rotations."""
 
     start: float  # start of the step, s
@@ -81,7 +81,7 @@ class Tools(Touching):
         self._held = [(hold, faces) for hold, faces, _ in held_faces(setting)]
         """Prescribed displacements with their faces.  Tools must not touch these faces."""
         still = np.zeros(len(self.tools))
-        self.ways, self._end = Ways(0.0, 0.0, still, still), None
+        self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
             raise ValueError("tools: one is given twice, must be distinct")
         for tool in self.tools:
@@ -96,9 +96,9 @@ class Tools(Touching):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
         self.outside, sides = setting.sides.all(), 2 * grid.dim
-        taken = [faces.id * sides + faces.face for _, faces in self._held]
+        held = [faces.id * sides + faces.face for _, faces in self._held]
         own = self.outside.id * sides + self.outside.face
-        self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *taken]))
+        self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *held]))
 
     @property
     def free(self) -> bool:
@@ -109,9 +109,9 @@ class Tools(Touching):
     def masses(self) -> NDArray[np.float64]:
         """Masses, kg, and moments of inertia, kg m^2, of free tools (tools, q); 0 for other tools."""
         d = self.grid.dim
-        out = np.array([np.full(ways_of(d), tool.mass or 0.0) for tool in self.tools])
+        out = np.array([np.full(motion_count(d), tool.mass or 0.0) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
-            if tool.turns(d):
+            if tool.rotates(d):
                 row[d:] = tool.inertia(d)
         return out
 
@@ -119,7 +119,7 @@ class Tools(Touching):
     def guides(self) -> NDArray[np.float64]:
         """Projections (tools, q, q) onto the possible motions of free tools; in axisymmetry along the axis."""
         d = self.grid.dim
-        out = np.zeros((len(self.tools), ways_of(d), ways_of(d)))
+        out = np.zeros((len(self.tools), motion_count(d), motion_count(d)))
         out[:, d:, d:] = np.reshape(self.turning, (-1, 1, 1))
         for one, tool in zip(out, self.tools, strict=True):
             one[:d, :d] = tool.guide(d) * tool.free * (np.arange(d) >= self.grid.axisymmetric)[:, None]
@@ -128,19 +128,19 @@ class Tools(Touching):
     @property
     def turning(self) -> list[bool]:
         """Whether each tool is free and rotates."""
-        return [tool.turns(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
+        return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
 
     def pushes(self, t: float) -> NDArray[np.float64]:
         """Return the loads (tools, q), N, on free tools at time t (s); torques are zero."""
         d = self.grid.dim
-        out = np.zeros((len(self.tools), ways_of(d)))
+        out = np.zeros((len(self.tools), motion_count(d)))
         out[:, :d] = [np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools]
         return out
 
-    def going(self, ways: Ways, end: float | None = None) -> Tools:
+    def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
         """Return the tools with their displacements by loads in a step.  `end` is the end of a step with inertia, s."""
         tools = copy(self)
-        tools.ways, tools._end = ways, end
+        tools.by_loads, tools._end = by_loads, end
         return tools
 
     def pose(self, number: int, t: float) -> Pose:
@@ -160,15 +160,15 @@ class Tools(Touching):
         shift = in_step(share, before.shift, pose.shift, end.shift)
         if not (end.R != before.R).any():
             return pose._replace(shift=shift)
-        turns = [of.R @ before.R.T for of in (pose, end)]
-        angle = in_step(share, 0.0, *(np.arctan2(turn[1, 0], turn[0, 0]) for turn in turns))
-        return pose._replace(shift=shift, R=turned(angle) @ before.R)
+        rotations = [of.R @ before.R.T for of in (pose, end)]
+        angle = in_step(share, 0.0, *(np.arctan2(turn[1, 0], turn[0, 0]) for turn in rotations))
+        return pose._replace(shift=shift, R=rotation(angle) @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
         """Return the pose of a tool at time t (s); raise ValueError for motions that axisymmetry excludes."""
-        pose = tool.pose(t, self.grid.dim, self.ways.at(t)[self.tools.index(tool)])
+        pose = tool.pose(t, self.grid.dim, self.by_loads.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
-            what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
+            what = f"moves by {pose.shift}{' and rotates' * bool(pose.R[0, 1])} at t = {t:g} s"
             raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
         return pose
 
@@ -181,8 +181,8 @@ class Tools(Touching):
             out["tool_velocity"] = {name: tool.begins(d) for name, tool in tools.items() if tool.free}
         turning = dict(zip(self.names, self.turning, strict=True))
         if any(turning.values()):
-            out["tool_rotation"] = {name: np.array(0.0) for name, turns in turning.items() if turns}
-            out["tool_spin"] = {name: np.array(float(tools[name].spin)) for name, turns in turning.items() if turns}
+            out["tool_rotation"] = {name: np.array(0.0) for name, rotates in turning.items() if rotates}
+            out["tool_spin"] = {name: np.array(float(tools[name].spin)) for name, rotates in turning.items() if rotates}
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
@@ -194,7 +194,7 @@ class Tools(Touching):
     def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
         """Return the displacements and rotations (tools, q), or the velocities; zero for tools that are not free."""
         d = self.grid.dim
-        out = np.zeros((len(self.names), ways_of(d)))
+        out = np.zeros((len(self.names), motion_count(d)))
         for row, name in zip(out, self.names, strict=True):
             row[:d] = before[along].get(name, 0.0)
             row[d:] = before.get(around, {}).get(name, 0.0)
@@ -202,8 +202,8 @@ class Tools(Touching):
 
     def placed(self, place: Place) -> Loads:
         """Return the loads by contact with tools in a substep."""
-        ways = self._before(place)
-        tools = self.going(Ways(place.start, place.t, ways, ways), place.start + place.dt * place.inertia)
+        before = self._before(place)
+        tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
         if not self.free:
             return ToolLoads(tools, place)
         velocity = self._of_free(place.before, "tool_velocity", "tool_spin")
@@ -218,7 +218,7 @@ class Tools(Touching):
         patches = cut.surface(self.outside)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
-        resists = self._materials.table(cut.points, resistance)[patches.at]
+        resistances = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
         # the initial stress is balanced without loads on tools
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
@@ -230,18 +230,18 @@ class Tools(Touching):
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
-            scalars = [np.full(len(at), number), size[at], resists[at], pressure]
+            scalars = [np.full(len(at), number), size[at], resistances[at], pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
-        travel = Exchange(grid.comm, grid.owner(patches.cell[at]))
-        cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
+        cell, place, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         acts = np.ones(len(self.tools)), self.tools, poses
         pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
-        origin = Origin(travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
+        origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
-        pushes = Pushes([line(tool) for tool in self.tools], self.ways.before, along, np.array(loads))
+        pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
         return ContactLaw(self.names, self.tools, pairs), origin, pushes
 
     def _edge(
@@ -264,8 +264,8 @@ class Tools(Touching):
         edge = np.zeros(len(y), dtype=bool)
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
-                beside = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = everywhere(grid, lambda beside=beside: tool.solid(grid.least).normal(beside) @ pose.R.T)
+                shifted = pose.own(y + half * (e - n[:, [axis]] * n))
+                to = everywhere(grid, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
@@ -288,13 +288,13 @@ class Tools(Touching):
 
     def check_start(self, place: Place) -> None:
         """Raise an error for tools inside a body at the start, except at faces in contact from earlier steps."""
-        ways, t = self._before(place), place.start
+        before, t = self._before(place), place.start
         points = place.points
-        tools, patches = self.going(Ways(t, t, ways, ways)), place.cut.surface(self.outside)
+        tools, patches = self.going(LoadMotion(t, t, before, before)), place.cut.surface(self.outside)
         x = patches.now(points)
         for number, tool in enumerate(self.tools):
-            met = points.data[pressure_name(self.names[number])] > 0
-            deep, where = tools._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
+            loaded = points.data[pressure_name(self.names[number])] > 0
+            deep, where = tools._deepest(tool, np.concatenate([x[~loaded[patches.at]], points.x]), t)
             if deep > BEGINS:
                 what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
@@ -313,9 +313,9 @@ class Tools(Touching):
                     raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
             deep, where = self._deepest(tool, points.x, t)
-            held, there = self._deepest(tool, middle(corners), t)
+            held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
-                where = where if deep > NEAR else there
+                where = where if deep > NEAR else at_middle
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
             if where := self._passed(tool, (before.x, points.x), (place.start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
@@ -371,24 +371,24 @@ class Tools(Touching):
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
-        way = np.linalg.norm(end - y, axis=1)
-        gone = np.zeros(len(y))
+        length = np.linalg.norm(end - y, axis=1)
+        done = np.zeros(len(y))
         on = np.arange(len(y))
-        along = (end - y) / np.maximum(way, TINY)[:, None]
+        along = (end - y) / np.maximum(length, TINY)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
-        turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # the middle lies in the tool and changes the side
-        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned + self.grid.base)):
+        crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # the middle lies in the tool and changes the side
+        if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
-            at = y[on] + gone[on, None] * along[on]
+            at = y[on] + done[on, None] * along[on]
             gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
             inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
-            gone[on] += np.maximum(gap, STRIDE * h)
-            on = on[gone[on] < way[on]]
+            done[on] += np.maximum(gap, STRIDE * h)
+            on = on[done[on] < length[on]]
         return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
@@ -396,10 +396,10 @@ class Tools(Touching):
         h, pose = self.grid.least, self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
-        here = (
+        place = (
             np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
         )
-        return -deepest / h, first(self.grid.comm, here)
+        return -deepest / h, first(self.grid.comm, place)
 
 
 class ToolLoads(ContactProblem):
@@ -414,36 +414,36 @@ class ToolLoads(ContactProblem):
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))
         self._tools, self._place = tools, place
-        self.shares, self._gone = Shares(np.inf, 0.0, None), None
+        self.shares, self._earlier = Shares(np.inf, 0.0, None), None
 
-    def begun(self, shares: Shares, gone: Gone | None) -> ToolLoads:
+    def begun(self, shares: Shares, earlier: SubstepMotion | None) -> ToolLoads:
         """See `Loads`."""
         out = copy(self)
-        out.shares, out._gone = shares, gone
+        out.shares, out._earlier = shares, earlier
         return out
 
-    def flown(self, at: At) -> Gone:
+    def flown(self, at: At) -> SubstepMotion:
         """See `Loads`."""
-        return Gone(self.shares.own, self.pairs.poses)
+        return SubstepMotion(self.shares.own, self.pairs.poses)
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
         """See `ContactProblem`.  The time integration finds the velocity from tool positions in both substeps."""
         pairs = self.pairs
-        gone = pairs.carried - pairs.now
-        if self._gone is not None:
-            there = np.zeros_like(gone)
-            for number, pose in enumerate(self._gone.poses):
+        moved = pairs.carried - pairs.now
+        if self._earlier is not None:
+            before = np.zeros_like(moved)
+            for number, pose in enumerate(self._earlier.poses):
                 on = pairs.number == number
                 start = self._tools.pose(number, self._place.start)
-                there[on] = pose.put(start.own(pairs.now[on])) - pairs.now[on]
-            gone = gone - self.shares.before / self._gone.own * there
-        return gone / self.shares.own
+                before[on] = pose.put(start.own(pairs.now[on])) - pairs.now[on]
+            moved = moved - self.shares.before / self._earlier.own * before
+        return moved / self.shares.own
 
     def ended(self, at: At) -> Loads:
         """Return the loads by contact with the tools at their final positions."""
         out = copy(self)
-        ways = self._tools.ways
-        out._tools = self._tools.going(ways._replace(after=ways.before + self.found(at).travel))
+        by_loads = self._tools.by_loads
+        out._tools = self._tools.going(by_loads._replace(after=by_loads.before + self.found(at).motion))
         return out
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:

@@ -175,7 +175,7 @@ class CutDomains(Keyed):
         return total / whole
 
     def surface(self, faces: Surface) -> Patches:
-        """Return quadrature points on those faces of a surface that belong to points of this process.
+        """Return quadrature points on the faces of a surface that belong to points of this process.
 
         The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Shape
         functions of this cell are extended to the surface, so that loads act on nodes with stiffness.

@@ -67,12 +67,12 @@ def fitted_at(
     return fit.values(comm).reshape(m, *shape)
 
 
-def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return pairs of positions (m, d) and points at x (n, d) closer than `reach` (m,) along each axis; all in m."""
-    low, high = ((places + sign * reach[:, None]).T for sign in (-1, 1))
+def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    """Return pairs of positions (m, d) and points at x (n, d) closer than `radius` (m,) along each axis; all in m."""
+    low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))
     if not len(some):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    found = cKDTree(x[some]).query_ball_point(places, reach, p=np.inf)
+    found = cKDTree(x[some]).query_ball_point(places, radius, p=np.inf)
     return np.repeat(np.arange(len(places)), list(map(len, found))), some[np.concatenate(found).astype(np.int64)]

@@ -40,7 +40,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 FAST = 10
 """Fraction of a wave of two domains that the filter removes, for each crossed cell; at most 1.
 
-Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03 (relative changes of the result).
+Sensitivity (cycles scene): half the value changes the result by 1.5e-04, twice by 3.4e-04, finer cells by 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1

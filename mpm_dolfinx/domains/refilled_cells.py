@@ -30,7 +30,7 @@ from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resamp
 GAP = 0.01
 """Largest gap, in cells, between faces of two domains that still count as one surface.
 
-Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02 (relative changes of the result).
+Sensitivity (flow scene): half the value changes the result by 2.5e-05, twice by 0.0e+00, finer cells by 9.0e-02.
 """
 CRUMB = NEAR
 """Area, as a fraction of the cell, below which a part is dropped.  Other parts receive its mass.  Source: as `NEAR`."""

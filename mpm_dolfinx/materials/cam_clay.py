@@ -94,7 +94,7 @@ class ModifiedCamClay(Skeleton):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     bulk: Field = None
@@ -266,7 +266,7 @@ class BarcelonaBasic(ModifiedCamClay):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     r: Field = None

@@ -34,7 +34,7 @@ MATCHES = {
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under the square root, so that its derivative is finite at zero.
 
-Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.3e-11, twice by 1.0e-11, finer cells by 3.0e-02.
 """
 
 
@@ -65,7 +65,7 @@ class DruckerPrager(Frictional):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     hardening: Field = 0.0

@@ -209,7 +209,7 @@ def mean_size(grid: Grid) -> float:
 MOST = 100.0
 """Upper limit of the softness (elastic / tangent shear modulus), which is infinite in perfectly plastic flow.
 
-Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-03, twice by 5.0e-03, finer cells by 3.0e-02.
 """
 
 

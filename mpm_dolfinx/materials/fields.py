@@ -36,12 +36,12 @@ WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Change of a state variable from its initial value above which a point counts as yielded.
 
-Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 6.6e-05, twice by 1.4e-04, finer cells by 3.0e-02.
 """
 STIFFEST = 100.0
 """Upper limit of alpha^2 / S, divided by the skeleton's modulus lambda + 2G; it limits rounding errors.
 
-Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 1.2e-07, twice by 1.0e-07, finer cells by 3.0e-02.
 """
 
 
@@ -132,12 +132,12 @@ class SceneMaterials:
             values = {name: getattr(m, name) for name in self._fields[i]}
             count = sum(len(body) for body in bodies if body.material == i)
             self._add_shapes(_expanded(m, values, count), seeded, len(points))
-            here, rows = _rows(bodies, i, points.id)
+            found, rows = _rows(bodies, i, points.id)
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
                 self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
                 filled = np.zeros((len(points), *value.shape[1:]))
-                filled[here] = value[rows]
+                filled[found] = value[rows]
                 seeded[name] = filled + seeded[name] if name in seeded else filled
         seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
@@ -247,9 +247,9 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return conductivity, m/s, and index of the conductivity law as rows (n, 2), equal for equal conductivities.
+        """Return a key (n, 2) of each point, equal for equal conductivities: conductivity, m/s, and index of the law.
 
-        With a law that depends on position all rows differ.  The fraction of the index denotes the retention curve.
+        With a law that depends on position all keys differ.  The fraction of the index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -282,7 +282,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return S, dS/dp, 1/Pa, chi and k_r at pressures p (m,), Pa; rows (m, width): see `SaturationAt`."""
+        """Return S, dS/dp, 1/Pa, chi and k_r at pressures p (m,), Pa; rows (m, width): field `retention` of points."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -296,9 +296,8 @@ class SceneMaterials:
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
     def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the rows (n, width) of the points' retention curves, see `Retentions`."""
+        """Return the field `retention` (n, width) of the points, see `Retentions`."""
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
-        """Return the parameters (n, width) of the points' retention curves, see `Retentions`."""
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,): values at the points.
@@ -451,7 +450,7 @@ class SceneMaterials:
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return rows (n, c) that are equal at points with the same elastic constants, for any initial stress."""
+        """Return a key (n, c) of each point, equal for equal elastic constants, for any initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -597,18 +596,18 @@ def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
 
 def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the indices (m,) of points with a material, and their rows in the result of `_places`."""
-    here = []
+    found = []
     rows = []
     start = 0
     before = 0
     for body in bodies:
         if body.material == material:
             of_body = ((ids >= start) & (ids < start + len(body))).nonzero()[0]
-            here.append(of_body)
+            found.append(of_body)
             rows.append(ids[of_body] - start + before)
             before += len(body)
         start += len(body)
-    return np.concatenate(here), np.concatenate(rows)
+    return np.concatenate(found), np.concatenate(rows)
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:

@@ -30,7 +30,7 @@ class Frictional(Skeleton):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     dilates: ClassVar = True

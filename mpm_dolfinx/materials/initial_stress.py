@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 from mpi4py import MPI
 
@@ -208,10 +209,10 @@ class InitialStresses:
         seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.present_density(seeded)
         total = over_all(materials.grid.comm, total)
-        here = np.repeat(present, [len(body) for body in self._bodies])
-        corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
+        used = np.repeat(present, [len(body) for body in self._bodies])
+        corners = np.concatenate([body.corners() for body in compress(self._bodies, present)])
         base = materials.grid.base
-        weight, surface = overburden(corners - base, -gravity[-1] * total[here], points.x)
+        weight, surface = overburden(corners - base, -gravity[-1] * total[used], points.x)
         return [weight, surface + base[-1], materials.pore_stress(points)]
 
 

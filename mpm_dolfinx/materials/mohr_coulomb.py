@@ -54,7 +54,7 @@ class MohrCoulomb(Frictional):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     tension: Field = np.inf

@@ -40,7 +40,7 @@ Errors of the drained beam's tip deflection without and with mean dilatation, h 
 SEPARATION = 1e-4
 """Relative difference added between equal eigenvalues, so that their derivatives are finite.
 
-Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 1.8e-09, twice by 7.2e-09, finer cells by 1.5e-02.
 """
 
 
@@ -493,7 +493,7 @@ class Fluid:
     Raises
     ------
     ValueError
-        A constant out of its range.
+        A constant is out of its range.
     """
 
     bulk: float = 2.2e9

@@ -48,7 +48,7 @@ class SofteningDruckerPrager(DruckerPrager):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     residual: Field = None

@@ -31,13 +31,16 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty. Plateau (beam): halved 9.9e-06, doubled 1.9e-05, cells 1.5e-02 (relative changes)."""
+"""Strength of the ghost penalty.
+
+Sensitivity (beam scene): half the value changes the result by 9.9e-06, twice by 1.9e-05, finer cells by 1.5e-02.
+"""
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
 """Ratio of the volume fractions of two neighbouring cells below which their common face is penalised.
 
-Plateau (soil): halved 1.3e-03, doubled 5.9e-04, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 1.3e-03, twice by 5.9e-04, finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
 """Strength of the penalty with integration at the points; volume fraction of cells below which their faces have it."""

@@ -138,7 +138,7 @@ class GivenDisplacements(Acting):
         stress = self._materials.total_stress(now)
         modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
         firm = self._materials.confined_modulus(before)
-        # values at the last reset of the grid, like the stiffnesses: constant while the cut is valid
+        # values at the last reset of the grid, like the stiffnesses: constant until the next reset
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)

@@ -25,12 +25,12 @@ ALIGNED = 1e-2
 EVERYWHERE = 1e2
 """Normal penalty stiffness at each point of a side with a slope below `ALIGNED`, in units of resistance / cell size.
 
-Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.2e-05, twice by 1.7e-05, finer cells by 3.0e-02.
 """
 TENSE = 10
 """Factor of a side's stress in the modulus of the penalty: a side buckles if its stress exceeds the penalty.
 
-Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.8e-06, twice by 4.7e-06, finer cells by 3.0e-02.
 """
 CARRIED = 0.3  # largest plausible traction increment of a step / (resisting modulus and stress of the body)
 

@@ -265,7 +265,7 @@ class InertiaForms:
 
 
 class Mass:
-    """The mass of the bodies on the grid, while a cut is valid.
+    """Mass of the bodies on the grid, constant until the next reset of the grid.
 
     Parameters
     ----------

@@ -32,6 +32,7 @@ from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
+from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.mechanics.dried import OfSuction
@@ -43,7 +44,6 @@ from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.active import Active, ActiveSet
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
-from mpm_dolfinx.pores.retention import Retentions
 
 
 class MomentumForms:
@@ -60,10 +60,8 @@ class MomentumForms:
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the integration points then have `density`, kg/m^3, at the start of the step.
-    fluid_density : kg/m^3
-        Density of the fluid that pores absorb as they dilate; None without fluid.
-    symmetric
-        Whether the tangents of all laws are symmetric.
+    materials
+        Materials of the scene, and its fluid. With retention curves the points also carry retention, lever and pores.
     at_points
         Whether bodies are integrated at their material points.
     terms
@@ -72,8 +70,6 @@ class MomentumForms:
         Time at the end of the substep, and time since the start of the step, UFL constants.
     inertia
         Whether bodies may have inertia.
-    retentions
-        Retention laws, if some soil is unsaturated; the integration points then have retention, lever and pores.
     """
 
     def __init__(
@@ -82,17 +78,16 @@ class MomentumForms:
         laws: Sequence[tuple[type[Skeleton], FormPoints, bool]],
         pressure: fem.Function | None,
         gravity: fem.Constant | None,
-        fluid_density: float | None,
-        symmetric: bool,
+        materials: SceneMaterials,
         at_points: bool,
         terms: Sequence[Callable],
         t: fem.Constant,
         dt: fem.Constant,
         inertia: bool = False,
-        retentions: Retentions | None = None,
     ):
         self.grid = grid = pieces.grid
-        self._retentions = retentions
+        self._retentions = retentions = materials.retentions
+        symmetric = materials.symmetric
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
         """Displacement increment since the start of the step, m."""
@@ -102,20 +97,21 @@ class MomentumForms:
         self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
         """Forms of inertia, None in a scene without inertia."""
-        self._residuals, self._tangents = [], []
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
         self._of_suction = OfSuction(grid, self.dilatation) if dried else None
         self._local: dict[int, LocalUnknowns] = {}  # by index of the part
+        made = []
         for number, (law, points, locks) in enumerate(laws):
-            self._add_law(
-                number, law, points, locks, pressure, symmetric, by_scene(grid, None, law, points) | {"dt": dt}
-            )
+            given = by_scene(grid, None, law, points) | {"dt": dt}
+            made.append(self._forms_of_law(number, law, points, locks, pressure, symmetric, given))
+        self._residuals, self._tangents = zip(*made, strict=True)
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """Forms of the scene's conditions."""
         self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
         full = None if retentions is None else retentions.of("saturation", pressure, pieces)
-        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
+        wet = materials.fluid and materials.fluid.density
+        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, wet, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """Weight and user-defined terms, which act in all stages."""
         self.symmetric = symmetric and self.own.symmetric
@@ -128,7 +124,7 @@ class MomentumForms:
         self.active = Active(grid, pressure is not None, *kept)
         """Active cells; u is zero at nodes of other cells."""
 
-    def _add_law(
+    def _forms_of_law(
         self,
         number: int,
         law: type[Skeleton],
@@ -137,8 +133,8 @@ class MomentumForms:
         pressure: fem.Function | None,
         symmetric: bool,
         given: Mapping[str, fem.Constant],
-    ) -> None:
-        """Compile residual and tangent for the integration points of a law."""
+    ) -> tuple[ElementForces, ElementMatrices | StackedElementMatrices]:
+        """Return the compiled residual and tangent of the integration points of a law."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
         p = None
@@ -170,14 +166,13 @@ class MomentumForms:
         P, A = share * P, share * A
         stress = P * points.F.T
         turns = self.inertia is not None and not self.grid.axisymmetric
-        self._residuals.append(ElementForces(points.turn * stress if turns else stress, points))
+        residual = ElementForces(points.turn * stress if turns else stress, points)
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
             beside = beside._replace(along=[T * points.F.T for T in beside.along])
-            self._tangents.append(ElementMatrices(A, points, symmetric, beside))
-        else:
-            self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
+            return residual, ElementMatrices(A, points, symmetric, beside)
+        return residual, StackedElementMatrices(A, points, symmetric, beside)
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
         """Return derivatives of nodal forces with respect to cell pressures through suction: `OfSuction.rows`."""

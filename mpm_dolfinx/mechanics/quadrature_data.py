@@ -15,10 +15,10 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import cell_ratios
 from mpm_dolfinx.domains.domain_slopes import LinearGradients
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
+from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
@@ -88,12 +88,8 @@ class QuadraturePoints:
 
     Parameters
     ----------
-    grid
-        Background grid.
     scene, bodies
-        The materials of the scene, and all its bodies.
-    fluid
-        Pore fluid, if any.
+        The materials of the scene with its fluid, and all its bodies.
     weighs
         Whether the scene has gravity.
     extended
@@ -111,16 +107,8 @@ class QuadraturePoints:
         Whether the conductivity differs between points.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        scene: SceneMaterials,
-        bodies: Sequence[Body],
-        fluid: Fluid | None,
-        weighs: bool,
-        extended: bool,
-    ):
-        self._grid, self._fluid = grid, fluid
+    def __init__(self, scene: SceneMaterials, bodies: Sequence[Body], weighs: bool, extended: bool):
+        self._grid, self._fluid = grid, fluid = scene.grid, scene.fluid
         self._linear = LinearGradients(grid.comm, bodies) if scene.some_elastic else None
         self._scene = scene
         self._weighs = weighs

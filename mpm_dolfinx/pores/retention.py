@@ -376,7 +376,7 @@ class SaturationAt:
     def __call__(
         self, rows: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return S, dS/dp, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): fields `retention`."""
+        """Return S, dS/dp, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): the field `retention`."""
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
         return S, slope, chi, k
@@ -445,12 +445,12 @@ REACH = (1e-8, 1e8)
 ROWS = 4000
 """Number of tabulated suctions.
 
-Plateau (dry): halved 2.1e-08, doubled 2.6e-09, cells 6.6e-03 (relative changes of the result).
+Sensitivity (dry scene): half the value changes the result by 2.1e-08, twice by 2.6e-09, finer cells by 6.6e-03.
 """
 GAUSS = 8
 """Quadrature points between two tabulated suctions.
 
-Plateau (dry): halved 8.2e-10, doubled 1.5e-09, cells 6.6e-03 (relative changes of the result).
+Sensitivity (dry scene): half the value changes the result by 8.2e-10, twice by 1.5e-09, finer cells by 6.6e-03.
 """
 
 
@@ -470,7 +470,7 @@ FARTHEST = np.log(10)
 Celia's column of 25 and 100 cells, 28 time steps: 310 and 500 Newton steps with a limit of 2; with a limit of 4, 330
 and 920, and four time steps are reduced.
 
-Plateau (dry): halved 7.6e-10, doubled 9.8e-10, cells 6.6e-03 (relative changes of the result).
+Sensitivity (dry scene): half the value changes the result by 7.6e-10, twice by 9.8e-10, finer cells by 6.6e-03.
 """
 
 

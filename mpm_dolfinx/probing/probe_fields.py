@@ -54,13 +54,13 @@ class _Lattice:
         copy, number = np.divmod(cell, grid.cells)
         index = np.stack(np.unravel_index(number, tuple(grid.shape)), axis=1)
         steps = np.stack(np.unravel_index(np.arange(width**d), (width,) * d), axis=1)
-        there = index[:, None] + steps - CELLS
-        inside = ((there >= 0) & (there < grid.shape)).all(axis=2)
-        number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
+        place = index[:, None] + steps - CELLS
+        inside = ((place >= 0) & (place < grid.shape)).all(axis=2)
+        number = grid.number(np.where(inside[:, :, None], place, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
-        self.midpoint = grid.places(there, 0.5)
-        self.size = np.broadcast_to(grid.widths_of(np.clip(there, 0, grid.shape - 1).reshape(-1, d)), (inside.size, d))
-        self.size = self.size.reshape(there.shape)
+        self.midpoint = grid.places(place, 0.5)
+        self.size = np.broadcast_to(grid.widths_of(np.clip(place, 0, grid.shape - 1).reshape(-1, d)), (inside.size, d))
+        self.size = self.size.reshape(place.shape)
         self.middle = len(steps) // 2
         self.stride = width ** np.arange(d)[::-1]
         self.neighbours = {}
@@ -85,10 +85,10 @@ class _Around:
         d = scene.grid.dim
         m = len(probes.id)
         soils = np.column_stack([scene.materials.conducting(points), points.material])
-        here, at = points.find(probes.id)
+        known, at = points.find(probes.id)
         own = np.zeros((m, d + 4))
-        x = interpolate(points.corners[at], probes.xi[here]) if cut.domains else points.x[at]
-        own[here] = np.column_stack([x, soils[at], cut.cells_at(at, x)])
+        x = interpolate(points.corners[at], probes.xi[known]) if cut.domains else points.x[at]
+        own[known] = np.column_stack([x, soils[at], cut.cells_at(at, x)])
         x, key, cell = np.split(over_all(scene.grid.comm, own), [d, d + 3], axis=1)
         self._lattice = lattice = _Lattice(scene.grid, cell[:, 0].astype(np.int64))
         self._x = x
@@ -150,14 +150,14 @@ class _Around:
         start[:, self._lattice.middle] = True
         reached, passes = start & self._filled, groups | start
         for _ in range(2 * CELLS * self._grid.dim):
-            for (axis, end), (here, there) in self._lattice.neighbours.items():
-                reached[:, there] |= (reached & passes)[:, here] & self._opening(axis, end)
+            for (axis, end), (one, other) in self._lattice.neighbours.items():
+                reached[:, other] |= (reached & passes)[:, one] & self._opening(axis, end)
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
         """Return which pairs (m, n) of neighbours along an axis have an open face between them."""
-        here, there = self._lattice.neighbours[axis, end]
-        return (self._open[:, here, axis, end] > 0) & (self._open[:, there, axis, 1 - end] > 0)
+        one, other = self._lattice.neighbours[axis, end]
+        return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the probes; weight (d,): unit weight of the fluid, N/m^3."""

@@ -48,18 +48,20 @@ class Probes:
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, of the probes on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, interpolate(points.corners[at] - points.origin[at], self.xi[here]))
+        known, at = points.find(self.id)
+        return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the present positions (m, d), m, of the probes on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
+        known, at = points.find(self.id)
+        return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
-    def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _shared(
+        self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return the values (m, ...) of all probes on every process; here, values: of the probes on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
-        out[here] = values
+        out[known] = values
         return over_all(comm, out)
 
 

@@ -20,7 +20,7 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Accuracy of the time of an event, relative to the step. Source: the documented accuracy of `until`."""
+"""Accuracy of the time of an event, relative to the step. Source: definition, the documented accuracy of `until`."""
 
 Event = Callable[[Any], float]
 """A number or a boolean, as a function of the simulation."""

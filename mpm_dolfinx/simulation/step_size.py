@@ -155,10 +155,15 @@ class StepSize:
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content."""
+        """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content.
+
+        The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
+        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent, does
+        not fall with the step.
+        """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
-        allowed = self._allowed(report, control)
+        allowed = self.rtol * max(control.change, report.sealed)
         wrong, filled = report.fills
         errors = [
             (report.error, allowed),
@@ -166,14 +171,6 @@ class StepSize:
             (wrong, self.rtol * max(control.filled, filled)),
         ]
         return max(off / least if least > 0 else 0.0 if off == 0 else inf for off, least in errors)
-
-    def _allowed(self, report: Report, control: StepControl) -> float:
-        """Return the tolerance of the pressure error in a step, Pa.
-
-        It includes the undrained pressure change of the step, because freely draining pressures follow the motion.
-        Their error due to the step affects no motion. The grid's error, some percent, does not fall with the step.
-        """
-        return self.rtol * max(control.change, report.sealed)
 
 
 def measured(control: StepControl, report: Report, result: Result) -> StepControl:

@@ -123,7 +123,10 @@ def factor_of_safety(
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
     if simulation.state.stage.inertia:
         raise ValueError("factor_of_safety: bodies have inertia, must be quasi-static: stage(inertia=False)")
-    dt, steps = _step_of(simulation, dt), whole("steps", steps, 8)
+    if dt is None and simulation.scene.flows:
+        raise ValueError("dt = None: must be given where fluid flows: short for undrained, long for drained failure, s")
+    positive = {"allowed": "> 0 and finite", "test": lambda v: (0 < v) & (v < np.inf)}
+    dt, steps = float(numbers("dt", 1.0 if dt is None else dt, **positive)), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
     flag("progress", progress)
     comm = simulation.grid.comm
@@ -185,17 +188,6 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
     found = "come to rest" if begins else "slide"
     more = "" if begins else "; loads must be constant in time"
     raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor{more}")
-
-
-def _step_of(simulation: Simulation, dt: float | None) -> float:
-    """Return the length of a step, s, checked; 1 s by default."""
-    if dt is None and simulation.scene.flows:
-        raise ValueError("dt = None: must be given where fluid flows: short for undrained, long for drained failure, s")
-    return _positive("dt", 1.0 if dt is None else dt)
-
-
-def _positive(name: str, value: float) -> float:
-    return float(numbers(name, value, allowed="> 0 and finite", test=lambda v: (0 < v) & (v < np.inf)))
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:

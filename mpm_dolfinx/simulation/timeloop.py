@@ -24,7 +24,7 @@ from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
-from mpm_dolfinx.dynamics.energies import begun
+from mpm_dolfinx.dynamics.energies import initial_energies
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
@@ -180,8 +180,8 @@ def run(
                 if _take_step(simulation, rule, target, progress, events):
                     output(True)
                     return _note(simulation, stopwatch.read(_measured(simulation)))
-                there = rule.ended(simulation.state.t, target, simulation.state.control)
-                if times.each and not there:
+                reached = rule.ended(simulation.state.t, target, simulation.state.control)
+                if times.each and not reached:
                     output(False)
                 _show(bar, simulation.state, before)
             simulation.state = replace(simulation.state, t=target)
@@ -280,7 +280,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
-        outcome["energy"] = begun(scene.materials, state.points, state.stage.kinetic(outcome))
+        outcome["energy"] = initial_energies(scene.materials, state.points, state.stage.kinetic(outcome))
     return replace(state, outcome=outcome)
 
 

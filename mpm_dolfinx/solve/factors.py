@@ -267,10 +267,10 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
     while (high > low).any():
         axis = (high - low).argmax(axis=1)
         one = every, axis
-        middle, here = (low[one] + high[one]) // 2, at[one]
-        key = 3 * key + np.where(here == middle, 2, here > middle)
-        low[one] = np.where(here < middle, low[one], middle + (here > middle))
-        high[one] = np.where(here > middle, high[one], middle - (here < middle))
+        middle, place = (low[one] + high[one]) // 2, at[one]
+        key = 3 * key + np.where(place == middle, 2, place > middle)
+        low[one] = np.where(place < middle, low[one], middle + (place > middle))
+        high[one] = np.where(place > middle, high[one], middle - (place < middle))
     return np.argsort(key, kind="stable")
 
 

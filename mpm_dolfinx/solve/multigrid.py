@@ -38,7 +38,7 @@ FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
 Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. Without a direct solver a solve takes 126
 iterations, with GAMG 112; with a single sweep GMRES fails. With a direct solver both smoothers take the same time.
 """
-MAYBE, NOT, IS = 0, 1, 2  # see `_shared`
+MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
 
 
@@ -127,16 +127,16 @@ def interpolation(
     node; if it also interpolates to a fixed node, it must coincide with a free one. The columns are then independent.
     """
     rows, coarse, weights = _hats(places, nodal, lines)
-    beside = _hats(held, nodal, lines)[1]
+    near_fixed = _hats(held, nodal, lines)[1]
     whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # weight of the coinciding node, or of the coarse cell
-    states = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(beside), NOT)])
-    among = np.concatenate([coarse, beside])
+    states = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(near_fixed), NOT)])
+    among = np.concatenate([coarse, near_fixed])
     shape = tuple(int(n) for n in over_all(comm, among.max(axis=0, initial=0), MPI.MAX) + 3)  # indices start at -1
     keys, at = np.unique(np.ravel_multi_index((among + 1).T, shape), return_inverse=True)
     stated = np.full(len(keys), MAYBE)
     for word in (NOT, IS):
         stated[at[states == word]] = word
-    number, mine = _shared(comm, keys, int(np.prod(shape)), stated)
+    number, owned = _shared(comm, keys, int(np.prod(shape)), stated)
     column = number[at[: len(coarse)]]
     kept = column != NONE
     rows = rows[kept]
@@ -147,9 +147,9 @@ def interpolation(
     Q = scipy.sparse.coo_matrix((weights, (rows, column)), shape=(len(places), column.max(initial=-1) + 1)).tocsr()
     Q.sort_indices()
     csr = Q.indptr.astype(PETSc.IntType), Q.indices.astype(PETSc.IntType), Q.data
-    sizes = (len(places), None), (np.count_nonzero(mine), None)
+    sizes = (len(places), None), (np.count_nonzero(owned), None)
     found = np.column_stack(np.unravel_index(keys, shape)) - 1
-    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[mine], found[(number == NONE) & nodal]
+    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[owned], found[(number == NONE) & nodal]
 
 
 def _every_other(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,16 +197,16 @@ def _shared(
         Status of each candidate on this process: MAYBE, NOT or IS; the largest value of all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
-    asked, who = np.unique(ask.send(keys), return_inverse=True)
+    distinct, who = np.unique(ask.send(keys), return_inverse=True)
 
     def of_all(values: NDArray[np.int64], op: np.ufunc) -> NDArray[np.int64]:
-        found = np.full(len(asked), NONE if op is np.minimum else 0)
+        found = np.full(len(distinct), NONE if op is np.minimum else 0)
         op.at(found, who, ask.send(values))
         return ask.back(found[who])
 
     rank = np.where(of_all(stated, np.maximum) == NOT, NONE, comm.rank)
-    mine, number = (rank != NONE) & (of_all(rank, np.minimum) == comm.rank), np.full(len(keys), NONE)
-    own = np.count_nonzero(mine)
+    owned, number = (rank != NONE) & (of_all(rank, np.minimum) == comm.rank), np.full(len(keys), NONE)
+    own = np.count_nonzero(owned)
     start = comm.exscan(own) if comm.size > 1 else 0
-    number[mine] = (start or 0) + np.arange(own)
-    return of_all(number, np.minimum), mine
+    number[owned] = (start or 0) + np.arange(own)
+    return of_all(number, np.minimum), owned

@@ -46,12 +46,12 @@ REBALANCED = 6  # largest number of iterations with changing contacts / largest 
 LOOSEST = 1e-2
 """Largest residual after a linear solve / residual before the solve.
 
-Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.2e-11, twice by 6.0e-12, finer cells by 3.0e-02.
 """
 SOLVED = 0.05
 """Residual after the last linear solve / tolerance.
 
-Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-12, twice by 3.1e-11, finer cells by 3.0e-02.
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end: above it the contact area still changes
 ERROR = 1 / 20
@@ -68,6 +68,7 @@ SUDDEN = np.sqrt(2)
 
 The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2). The changes there
 are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma if pressures follow loads.
+Source: exact, the ratio of these changes.
 """
 
 
@@ -237,7 +238,7 @@ class Newton:
         keep = self._solvers.plan.keep
         count = 0
         slow = False
-        went: NDArray[np.float64] | float = 0.0
+        log_change: NDArray[np.float64] | float = 0.0
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
             if found is not errors:  # converged, but contact forces or multipliers have changed
@@ -252,7 +253,7 @@ class Newton:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
             if self._storage is not None:
-                went = self._solvers.restrain(self._storage, went)
+                log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
             # infinite before any fluid has been exchanged
@@ -448,8 +449,8 @@ class Newton:
         if (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
-        begun = Halving() if elastic else Search()
-        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], begun)
+        start = Halving() if elastic else Search()
+        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], start)
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)

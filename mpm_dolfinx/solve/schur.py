@@ -303,17 +303,17 @@ class LinearSolvers:
         b.array_w[:] *= scale
         x.array_w[:] *= scale
 
-    def restrain(self, storage: StorageProblem, went: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
+    def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
         """Limit the decrease of pressures in the direction as the retention curves require; update displacements."""
         if not storage.forms.retains:
-            return went
-        dp, went = storage.restrained(self.dp.array_r, went)
+            return log_change
+        dp, log_change = storage.restrained(self.dp.array_r, log_change)
         far = not np.array_equal(dp, self.dp.array_r)
         if self.du.comm.tompi4py().allreduce(far, MPI.LOR):
             self.dp.array_w[:] = dp
             if self._block is None:
                 self._follow()
-        return went
+        return log_change
 
     def _follow(self) -> None:
         """Solve for the displacements that balance the direction of the pressures."""

@@ -56,19 +56,19 @@ THRESHOLDS = Thresholds()
 FORCING = 1e-5
 """Tightest relative tolerance of a linear solve.
 
-Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-11, twice by 1.2e-11, finer cells by 3.0e-02.
 """
 FORCING_3D = 1e-3
 """Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
 """Largest ratio of successive residuals for which the next Newton step reuses the tangent.
 
-Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.9e-11, twice by 1.0e-11, finer cells by 3.0e-02.
 """
 KEEP_WET = 0.01
 """As `KEEP`, in wet 2D scenes without yield.
 
-Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 1.8e-11, twice by 2.9e-10, finer cells by 1.5e-02.
 """
 
 

@@ -50,12 +50,12 @@ class Start(NamedTuple):
     acting: list[Acting]
     renewed: int = 0
 
-    def begun(self, acting: Acting, gone: Sequence[Any] | None) -> Acting:
+    def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
         """Return the loads at the beginning of a substep; gone: their data from the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
-        before = gone or [None] * len(acting.loads)
+        before = earlier or [None] * len(acting.loads)
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:

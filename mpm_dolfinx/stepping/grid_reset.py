@@ -565,7 +565,7 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function of whether a step begins, which returns the fluxes at u.
+        """Return the fluid conditions, and a function that returns the fluxes at u; argument: whether a step begins.
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 
@@ -648,7 +648,7 @@ def assembled(
 
     def make() -> System:
         if not stage.inertia and not any(one.holding for one in loads):
-            check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
+            check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
         return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells

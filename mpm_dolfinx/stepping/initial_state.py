@@ -7,7 +7,7 @@ pressures remove these forces. Their deformation adds to the elastic strain of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -22,23 +22,22 @@ from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
-from mpm_dolfinx.bodies.bodies import Body, pressure_at
+from mpm_dolfinx.bodies.bodies import pressure_at
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Loads, Place
 from mpm_dolfinx.conditions.conditions import Quiet
 from mpm_dolfinx.conditions.sides import everywhere
-from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units, waters
+from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
 from mpm_dolfinx.contact.groups import contacts_of
-from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
-from mpm_dolfinx.dynamics.at_rest import borne
+from mpm_dolfinx.dynamics.at_rest import balancing_tractions
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides, traction_name
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.materials.initial_stress import OfWater, strained
+from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
@@ -70,27 +69,28 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene in its first stage, with given stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    begun = _stage(scene, conditions, present, later)
-    if scene.initial.given and (quiet := begun.of(Quiet)):
+    first = _stage(scene, conditions, present, later)
+    if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
             f"{next(iter(quiet))}: cannot hold an initial stress, must begin a stage later: first prescribe the side"
         )
-    _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
+    comm, gravity = scene.grid.comm, first.conditions["gravity"]
+    warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
     if scene.fluid and scene.materials.conducts:
-        warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
-    points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
-    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
+        warn_units(comm, scene.fluid, gravity)
+    points = scene.materials.seeded.of(scene.ids(present))
+    points = scene.initial.of(scene.materials, points, present, first.gravity_at(0.0) if scene.initial.given else None)
     pieces = None
-    scene.rests_at(begun, 0.0)
+    scene.rests_at(first, 0.0)
     if scene.fluid:
         placed = callable(scene.initial.pressure) or scene.materials.retentions is not None
         pieces = pieces_at_start(scene, points) if placed else at_start(points)
     return State(
         t=0.0,
-        points=_gripped(scene, begun, points),
+        points=_gripped(scene, first, points),
         pieces=pieces,
-        outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
-        stage=begun,
+        outcome=first.unknown(np.nan if scene.initial.given else 0.0),
+        stage=first,
     )
 
 
@@ -114,56 +114,56 @@ def begin_stage(
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are still to be added")
     flag("stage: reset_displacement", reset_displacement)
-    present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
+    present = [(is_present and body not in remove) or body in add for body, is_present in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
-    begun = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
-    if "gravity" in named or waters(begun.given) != waters(before.given):
-        _warn_weights(scene, begun, {})
+    after = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    if "gravity" in named or waters(after.given) != waters(before.given):
+        warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
-        _warn_moved_on(scene, before, begun)
-    new_quiet = {name: one for name, one in begun.of(Quiet).items() if name not in begun.same(before)}
+        _warn_moved_on(scene, before, after)
+    new_quiet = {name: one for name, one in after.of(Quiet).items() if name not in after.same(before)}
     if new_quiet and before.inertia:
         raise ValueError(f"{next(iter(new_quiet))}: must act from the first stage in which its bodies have inertia")
-    state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
+    state, tractions = _released(scene, state, after, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
     state = scene.followed(state)
     if state.stays:  # points have the pressures of their cells, not of their pieces
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
     own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
-    gone, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
-    there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    bare, gravity = let_go(state.points, before.data_names(before.named)), None
+    removed, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
+    standing = [body for body, is_present in enumerate(before.present) if is_present and body not in remove]
+    bare, gravity = _without_data(state.points, before.data_names(before.named)), None
     if scene.initial.given:
-        gravity = begun.gravity_at(state.t)
+        gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
         what = f"stage: add: body {add[0]}: domains of others have been renewed"
         raise ValueError(f"{what}, must come before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
-    points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
-    others = before.data_names(before.named.keys() - begun.same(before))
-    points = _gripped(scene, begun, points, let_go(state.points, others))
+    points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
+    others = before.data_names(before.named.keys() - after.same(before))
+    points = _gripped(scene, after, points, _without_data(state.points, others))
     for name, (ids, values) in tractions.items():
-        here, at = points.find(ids)
+        known, at = points.find(ids)
         rows = points.data[name].copy()
-        rows[at] = values[here]
+        rows[at] = values[known]
         points = replace(points, data=points.data | {name: rows})
     if pieces is not None:
-        pieces = pieces.of(gone, kept=False).joined(at_start(new))
+        pieces = pieces.of(removed, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
-    if begun.inertia and not before.inertia:
+    if after.inertia and not before.inertia:
         points = replace(points, data=points.data | resting(points))
     if reset_displacement:
         points = replace(points, origin=points.corners)
-    outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
-    rest = state.rest if _holds_as(begun, before) else None
-    new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
+    rest = state.rest if _holds_as(after, before) else None
+    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
     return replace(state, points=points, pieces=pieces, **new)
 
 
 def _released(
-    scene: Scene, state: State, begun: Stage, quiet: Mapping[str, Quiet]
+    scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return a state before the next step, and tractions on new quiet sides: points (m,) and (m, d), Pa, by data name.
 
@@ -174,19 +174,19 @@ def _released(
     when, given = When(state.t, 1.0, start.acting[-1].gravity, 1.0, 0.0), (start.data, start.acting[-1].loads)
     problem = scene.balance(when, start.matrices.momentum, *given, held=state.held)
     forces = problem.unbalanced().reshape(-1, scene.grid.dim)
-    surfaces = next(of for of in begun.acting if isinstance(of, QuietSides)).named(quiet)
+    surfaces = next(of for of in after.acting if isinstance(of, QuietSides)).named(quiet)
     cut = start.on_grid.cut
 
-    def beside(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
+    def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
         """Return the components (nodes, d) along `axes` at nodes of cells that contain the faces `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
-    now, then = ~begun.free, ~state.stage.free
-    for of, held in ((begun, now), (state.stage, then)):
+    now, then = ~after.free, ~state.stage.free
+    for of, held in ((after, now), (state.stage, then)):
         for _, faces, axes in of.held:
-            held |= beside([faces], axes)
-    counts = ~now & (beside(list(surfaces.values()), range(scene.grid.dim)) | ~then)
+            held |= near([faces], axes)
+    counts = ~now & (near(list(surfaces.values()), range(scene.grid.dim)) | ~then)
     owned = momentum.u.function_space.dofmap.index_map.size_local
     given = scene.grid.comm, list(map(len, scene.bodies)), state.points
     stresses = {
@@ -194,72 +194,61 @@ def _released(
         for name, faces in surfaces.items()
     }
     parts = start.matrices.momentum.parts
-    found = borne(cut, state.points, stresses, surfaces, parts, (forces * counts)[:owned], now)
+    found = balancing_tractions(cut, state.points, stresses, surfaces, parts, (forces * counts)[:owned], now)
     return state, {traction_name(name): of for name, of in found.items()}
 
 
 def _gripped(
-    scene: Scene, begun: Stage, points: MaterialPoints, before: MaterialPoints | None = None
+    scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
     """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
-    kept = begun.kept(len(points))
-    if taken := sorted(kept.keys() & scene.materials.seeded.data.keys()):
-        raise ValueError(f"{taken[0]!r}: points have data of this name, must be another name of a condition")
-    return gripped(points, kept, before)
+    kept = after.kept(len(points))
+    if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
+        raise ValueError(f"{clashes[0]!r}: points have data of this name, must be another name of a condition")
+    if before is not None:
+        known, at = before.find(points.id)
+        for name in kept.keys() & before.data.keys():
+            kept[name][known] = before.data[name][at]
+    return replace(points, data={**points.data, **kept}) if kept else points
 
 
-def _holds_as(begun: Stage, before: Stage) -> bool:
+def _without_data(points: MaterialPoints, names: Collection[str]) -> MaterialPoints:
+    """Return the points without the data of these names."""
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
+
+
+def _holds_as(after: Stage, before: Stage) -> bool:
     """Return whether the same conditions support the same faces."""
-    return len(begun.held) == len(before.held) and all(
+    return len(after.held) == len(before.held) and all(
         hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
-        for (hold, faces, _), (was, then, _) in zip(begun.held, before.held, strict=True)
+        for (hold, faces, _), (was, then, _) in zip(after.held, before.held, strict=True)
     )
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return the conditions with the scene's contacts, which stages cannot change."""
-    there, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
-    if given and given != there:
+    standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
+    if given and given != standing:
         raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
-    return [*conditions, *(() if given else there)]
+    return [*conditions, *(() if given else standing)]
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    of = scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum
-    return stage(*of, scene.storage.feeding if scene.storage else (), conditions, present, later)
+    feeding = scene.storage.feeding if scene.storage else ()
+    return stage(scene.bodies, scene.materials, scene.momentum, feeding, conditions, present, later)
 
 
-def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
-    """Warn of each water level, given or on a side, if its unit weight differs from the pore fluid's.
-
-    In a dry scene warn of each level with the unit weight of water, if gravity has another magnitude.
-    """
-    gravity, fluid = begun.conditions["gravity"], scene.fluid
-    g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
-    levels = [*given.items(), *waters(begun.named)]
-    if fluid is None:
-        levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
-        own, of = 1000 * g, "water under the scene's gravity"
-    else:
-        own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
-    weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
-    for name, weight in sorted(weights):
-        if abs(weight - own) > WEIGHS * max(weight, own):
-            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(scene.grid.comm, ConditionWarning, f"{what}: at one level they are not at rest", name, weight, of, own)
-
-
-def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
+def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
     """Warn of each unchanged condition that also acts on faces that an excavation has exposed."""
     stop = np.cumsum([len(body) for body in scene.bodies])
-    for name, condition in begun.given.items():
+    for name, condition in after.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
             continue
         where = condition.side, getattr(condition, "region", None)
-        was, now = (surface(scene.bodies, *where, s.present) for s in (before, begun))
+        was, now = (surface(scene.bodies, *where, s.present) for s in (before, after))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
-        here = np.repeat(before.present, [len(body) for body in scene.bodies])
-        new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))
+        was_present = np.repeat(before.present, [len(body) for body in scene.bodies])
+        new = np.flatnonzero(was_present[now.id] & (bare[now.id] > SAME * now.whole0))
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
             what = "stage: remove: %s is unchanged and now also acts on %.3g m^%d of newly exposed faces, first at %s"
@@ -268,23 +257,23 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
 
 
 def _filled(
-    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
+    scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
     """Return all points with added bodies, and the points of these bodies alone; a body follows the body it lies on."""
-    there = list(there)
+    standing = list(standing)
     waiting = list(add)
-    new = scene.materials.seeded.of(_ids(scene.bodies, []))
+    new = scene.materials.seeded.of(np.empty(0, np.int64))
     while waiting:
-        fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
-        placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
-        placed = put(scene.grid, scene.bodies, there, fill, points, placed)
+        fill = next((body for body in waiting if touches(scene.bodies, standing, body)), waiting[0])
+        placed = scene.materials.seeded.of(scene.ids(np.arange(len(scene.bodies)) == fill))
+        placed = put(scene.grid, scene.bodies, standing, fill, points, placed)
         placed = scene.initial.of(
-            scene.materials, placed, [i in (*there, *add) for i in range(len(scene.bodies))], gravity
+            scene.materials, placed, [i in (*standing, *add) for i in range(len(scene.bodies))], gravity
         )
         if scene.momentum.inertia is not None:
             placed = replace(placed, data=placed.data | resting(placed))
         points, new = points.joined(placed), new.joined(placed)
-        there.append(fill)
+        standing.append(fill)
         waiting.remove(fill)
     return points, new
 
@@ -297,13 +286,7 @@ def _without_extra(
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
         raise ValueError(f"{what}, must be given for all points in fields=")
-    return replace(points, data={name: rows for name, rows in points.data.items() if name not in extra})
-
-
-def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
-    """Return the numbers of the points of chosen bodies."""
-    stop = np.cumsum([len(body) for body in bodies])
-    return np.concatenate([np.empty(0, np.int64), *(np.arange(stop[i] - len(bodies[i]), stop[i]) for i in chosen)])
+    return _without_data(points, extra)
 
 
 def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
@@ -341,13 +324,13 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     held = contents.total(store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
     mean = contents.total(weight * pi) / contents.total(weight)
-    wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
-    pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
+    target = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
+    pi = pi + (mass_potential(target, bulk) - mean)[contents.slot(cut.cells)]
     p = pressure_of(pi, bulk)
     water = on_grid.pore_water(points)
     if water is not None:
-        offset = p - wanted[water.slot]
-        p = water.level(water.of_cells(wanted[water.slot] + on_grid.heads), wanted, offset)[water.slot] + offset
+        offset = p - target[water.slot]
+        p = water.level(water.of_cells(target[water.slot] + on_grid.heads), target, offset)[water.slot] + offset
     p = cut.to_pieces(p)
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
     return PiecePressures(points.id[pieces.point], pieces.cell, pieces.fraction, p, pieces.x, 0 * pieces.x, bounds)

@@ -52,8 +52,8 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
     if hasattr(grid.follow, "pose"):
         for name, one in state.stage.given.items():
             if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
-                way = one.pose(state.t, grid.dim, state.outcome["tool_travel"][name]).shift
-                return carried(grid.seeded, way)
+                shift = one.pose(state.t, grid.dim, state.outcome["tool_travel"][name]).shift
+                return carried(grid.seeded, shift)
         return before
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
     lines = grid.from_base(

@@ -34,7 +34,7 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import FACES, centroids, volumes
@@ -50,12 +50,12 @@ class Renewal:
 
     Parameters
     ----------
-    grid, bodies, materials
-        Grid, bodies and materials of the scene.
+    bodies, materials
+        Bodies and materials of the scene.
     """
 
-    def __init__(self, grid: Grid, bodies: Sequence[Body], materials: SceneMaterials):
-        self._grid = grid
+    def __init__(self, bodies: Sequence[Body], materials: SceneMaterials):
+        self._grid = materials.grid
         self._bodies = bodies
         self._starts = np.cumsum([0, *map(len, bodies)])
         self._materials = materials
@@ -78,8 +78,8 @@ class Renewal:
     def _faces(self, points: MaterialPoints) -> OuterFaces:
         """Return the outer faces of the points."""
         seeded = self._outer
-        here, at = points.find(seeded.point)
-        columns = [(at, *(v[here] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
+        known, at = points.find(seeded.point)
+        columns = [(at, *(v[known] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
         if PARENT in points.data:
             at, face = np.nonzero(points.data[PARENT] >= 0)
             columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
@@ -142,7 +142,7 @@ class Renewal:
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, touched)
         kept = ~work.affected
-        gone = points.id[work.affected]
+        replaced = points.id[work.affected]
         stay, pieces = state.stay, state.pieces
         if stay is not None:
             rows = _joined(stay.points, made, kept)
@@ -153,8 +153,8 @@ class Renewal:
             brought = at_start(replace(made, pressure=pressure))
             if pieces.of_cell is not None:
                 brought = replace(brought, of_cell=pressure, start=pressure)
-            pieces = pieces.of(gone, kept=False).joined(brought)
-        return replace(state, points=_joined(points, made, kept), pieces=pieces, stay=stay), len(gone)
+            pieces = pieces.of(replaced, kept=False).joined(brought)
+        return replace(state, points=_joined(points, made, kept), pieces=pieces, stay=stay), len(replaced)
 
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
@@ -165,14 +165,14 @@ class Renewal:
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
-        there = transport(old.potentials(bulk), points, pieces)
+        potential = transport(old.potentials(bulk), points, pieces)
         piece, groups, share = work.into
         of, count = pieces.point[piece], int(group.max()) + 1
-        lost = pieces.fraction.copy()
-        lost[piece] = 0.0  # very thin pieces, which are added to the others of their domain
-        whole, held = (sum_by(pieces.point, lost * values, len(points)) for values in (1.0, there))
+        others = pieces.fraction.copy()
+        others[piece] = 0.0  # very thin pieces, which are added to the others of their domain
+        whole, held = (sum_by(pieces.point, others * values, len(points)) for values in (1.0, potential))
         mean = np.divide(held, whole, out=np.zeros(len(points)), where=whole > 0)[of]
-        brings = pieces.fraction[piece] * there[piece] + (share - pieces.fraction[piece]) * mean
+        brings = pieces.fraction[piece] * potential[piece] + (share - pieces.fraction[piece]) * mean
 
         def over(values: NDArray, weight: NDArray) -> NDArray:
             return sum_by(groups, values * weight[of], count)
@@ -207,7 +207,7 @@ class Renewal:
         corners, group, parent, area, ends = (np.concatenate(column) for column in zip(*new, strict=True))
         old, at, share = work.pairs(corners, group)
         piece, groups, part = work.into
-        gone = work.pieces.point[piece]
+        source = work.pieces.point[piece]
         n, mass = len(corners), points.volume0
         J = points.J
         weight = share * mass[old]
@@ -218,7 +218,7 @@ class Renewal:
 
         size = np.abs(volumes(corners))
         count = int(group.max()) + 1
-        M, V = (sum_by(groups, part * of[gone], count) for of in (mass, mass * J))
+        M, V = (sum_by(groups, part * of[source], count) for of in (mass, mass * J))
         A = sum_by(group, size, count)
 
         def mean(values: NDArray) -> NDArray:
@@ -228,8 +228,8 @@ class Renewal:
             means = np.stack([sum_by(at, weight * column, n) / total for column in flat[old].T], axis=1)
             means = means + np.einsum("ni,nik->nk", off, work.slopes(flat, group))
             low, high = np.full((count, flat.shape[1]), np.inf), np.full((count, flat.shape[1]), -np.inf)
-            np.minimum.at(low, groups, flat[gone])
-            np.maximum.at(high, groups, flat[gone])
+            np.minimum.at(low, groups, flat[source])
+            np.maximum.at(high, groups, flat[source])
             return np.clip(means, low[group], high[group]).reshape(n, *values.shape[1:])
 
         like = np.exp(mean(np.log(J)))
@@ -241,13 +241,13 @@ class Renewal:
             """Return means whose sum by mass is exact: the defect is distributed within the range of the values."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
-                missing = sum_by(groups, part * (mass * of)[gone], count) - sum_by(group, volume0 * column, count)
+                missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
                 end = np.full(count, np.inf), np.full(count, -np.inf)
-                np.minimum.at(end[0], groups, of[gone])
-                np.maximum.at(end[1], groups, of[gone])
-                room = np.where(missing > 0, end[1], end[0])[group] - column
-                whole = sum_by(group, volume0 * room, count)
-                column += np.divide(missing, whole, out=np.zeros(count), where=whole != 0)[group] * room
+                np.minimum.at(end[0], groups, of[source])
+                np.maximum.at(end[1], groups, of[source])
+                margin = np.where(missing > 0, end[1], end[0])[group] - column
+                whole = sum_by(group, volume0 * margin, count)
+                column += np.divide(missing, whole, out=np.zeros(count), where=whole != 0)[group] * margin
             return means.reshape(n, *values.shape[1:])
 
         material = np.zeros(n, dtype=points.material.dtype)
@@ -313,5 +313,5 @@ def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArr
     whole = np.tile(np.eye(3), (len(F), 1, 1))
     seen = F if across is None else in_space(F, across)
     whole[:, : seen.shape[1], : seen.shape[1]] = seen
-    back = np.linalg.inv(whole)
-    return back @ b @ back.swapaxes(1, 2)
+    inverse = np.linalg.inv(whole)
+    return inverse @ b @ inverse.swapaxes(1, 2)

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.tables import data_frame, data_set
-from mpm_dolfinx.conditions.acting import MOTIONS
+from mpm_dolfinx.conditions.acting import MOTIONS, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
-OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", *MOTIONS, "energy")
-OUTCOMES += ("runoff", "flowed", "ran_off", "ponded")
+OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", "runoff", "flowed", "ran_off", "ponded")
 """Quantities of the package's conditions; user-defined conditions may have others."""
 
 

@@ -26,7 +26,6 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
-from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.initial_stress import InitialStresses
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
@@ -108,14 +107,11 @@ class Scene:
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and time since the start of the step, s, as constants of forms."""
         inside = [term for term in terms if not isinstance(term, OnSide)]
-        self.pieces = QuadraturePoints(grid, scene, bodies, fluid, weighs, bool(len(inside) + len(sources)))
+        self.pieces = QuadraturePoints(scene, bodies, weighs, bool(len(inside) + len(sources)))
         laws, p = self.pieces.laws, CellPressure(*(fem.Function(grid.cellwise()) for _ in range(3))) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
-            wet = fluid.density if fluid else None
-            options = (self.gravity, wet, scene.symmetric)
-            options = (*options, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
-            options = (*options, scene.retentions)
-            self.momentum = MomentumForms(self.pieces.pieces, laws, p and p.now, *options)
+            options = (scene, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
+            self.momentum = MomentumForms(self.pieces.pieces, laws, p and p.now, self.gravity, *options)
         if scheme.coupling == "schur-cg" and not (self.momentum.symmetric and scene.retentions is None):
             scheme = replace(scheme, coupling="schur-fgmres")
         self.scheme, self.storage = scheme, None
@@ -125,13 +121,9 @@ class Scene:
             moves = self.momentum.inertia
             inertial = None if moves is None else -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
             pieces = self.pieces.pieces
-            u = self.momentum.u
-            laws = scene.conductivity_laws
-            law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
-            kind = (symmetric, scene.conducts, scene.evolves)
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
-            of_fluid = (fluid.bulk, weight, *kind, law, feeding, inertial, scene.retentions)
-            self.storage = StorageForms(pieces, u, p, self.momentum.active, *of_fluid)
+            of_fluid = (scene, weight, symmetric, feeding, inertial)
+            self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -255,7 +247,7 @@ class Scene:
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
             raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain")
-        return Renewal(grid, self.bodies, self.materials)
+        return Renewal(self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
@@ -299,9 +291,9 @@ class Scene:
 
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
-    def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
-        """Return the numbers of all points of the present bodies."""
-        return np.flatnonzero(np.repeat(present, [len(body) for body in self.bodies]))
+    def ids(self, chosen: Sequence[bool]) -> NDArray[np.int64]:
+        """Return the numbers of all points of the chosen bodies."""
+        return np.flatnonzero(np.repeat(chosen, [len(body) for body in self.bodies]))
 
     @cached_property
     def description(self) -> dict[str, Any]:

@@ -43,7 +43,6 @@ from mpm_dolfinx.flow.drained_sides import DrainedSides
 from mpm_dolfinx.flow.feeding import Feeding
 from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.materials.skeleton import Fluid
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
@@ -170,7 +169,9 @@ class Stage:
                 out[quantity] = out.get(quantity, {}) | values
         return out
 
-    def begun(self, before: Stage, outcome: Outcome, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+    def initial_outcome(
+        self, before: Stage, outcome: Outcome, value: float
+    ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the results of conditions at the beginning of the stage; for new conditions `value`."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
@@ -198,10 +199,8 @@ class Stage:
 
 
 def stage(
-    grid: Grid,
     bodies: Sequence[Body],
     materials: SceneMaterials,
-    fluid: Fluid | None,
     momentum: MomentumForms,
     fed: Sequence[Feeding],
     conditions: Mapping[str, Any],
@@ -212,12 +211,8 @@ def stage(
 
     Parameters
     ----------
-    grid, bodies
-        Background grid, and all bodies of the scene.
-    materials
-        Materials of the scene.
-    fluid
-        Pore fluid, or None.
+    bodies, materials
+        All bodies and materials of the scene.
     momentum, fed
         Forms with the loads of all stages; terms of all stages in the balance of fluid.
     conditions
@@ -230,6 +225,7 @@ def stage(
     ValueError
         A condition is invalid; the message has its name, its value and the allowed values.
     """
+    grid, fluid = materials.grid, materials.fluid
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
@@ -248,10 +244,10 @@ def stage(
     sides = Sides(grid, bodies, present)
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
-    feeding += [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
+    feeding += [kind(setting, some) for kind in FED if (some := setting.of(*kind.conditions))]
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
-    acting += [kind(setting, mine) for kind, mine in found if mine]
+    acting += [kind(setting, some) for kind, some in found if some]
     lattice = lattices(bodies, present, [(faces, axes) for one in acting for _, faces, axes in one.held])
     return Stage(
         given=given_by_name,

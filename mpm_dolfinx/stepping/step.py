@@ -50,11 +50,11 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
-    state, gone = start.state, None
+    state, earlier = start.state, None
     on_grid, solvers = start.on_grid, start.matrices.solvers
     flights, found = [flight_of(start)], []
     for placed in start.acting:
-        acting = start.begun(placed, gone)
+        acting = start.begun(placed, earlier)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         problem = both.momentum, both.storage, partial(on_grid.as_reset, state)
@@ -63,7 +63,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
-        gone = [one.flown(both.momentum.at) for one in acting.loads]
+        earlier = [one.flown(both.momentum.at) for one in acting.loads]
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers
