@@ -265,10 +265,15 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance."""
+        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance.
+
+        Raise NotConverged after as many updates as Newton's method may take iterations.
+        """
         momentum = self._momentum
+        count = 0
         while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
-            errors = self._errors(errors.start)
+            self._check(count, "newton")
+            errors, count = self._errors(errors.start), count + 1
         return errors
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
