@@ -28,8 +28,8 @@ def gradient(
         Current corners, and reference corners.
     """
     if corners.shape[2] == 2:
-        dx, dX = (y[:, [3, 2]] - y[:, [0, 1]] for y in (corners, reference))
-        F = np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        dx, dX = (y[:, :1:-1] - y[:, :2] for y in (corners, reference))  # the diagonals
+        F = dx.swapaxes(1, 2) @ cofactor(dX) / determinant(dX)[:, None, None]
         if not axisymmetric:
             return F
         out = np.zeros((len(F), 3, 3))
