@@ -139,7 +139,7 @@ def functions(name: str, values) -> None:
 
 
 def asked(name: str, allowed: str, function: Callable, *values):
-    """Return the value of a user's function.  Its exceptions become a ValueError that names the object."""
+    """Return the value of a user's function.  Exceptions become a ValueError that names the object."""
     try:
         return function(*values)
     except Exception as error:

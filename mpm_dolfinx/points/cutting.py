@@ -29,7 +29,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
-"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` may have an open face. Source: epsilon."""
+"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
 TANGLED = 0.2  # volume between the corners / volume of the domain; below it corners are re-initialised from F
 
@@ -45,8 +45,7 @@ class Pieces:
     mixed (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2.
     hoop (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
     product of its components, m^2; radius of this centroid, m.
-    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for
-    pieces with symmetric sections.
+    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; of symmetric rings.
     """
 
     point: NDArray[np.int64]

@@ -265,10 +265,15 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance."""
+        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance.
+
+        Raise NotConverged after as many updates as Newton's method may take iterations.
+        """
         momentum = self._momentum
+        count = 0
         while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
-            errors = self._errors(errors.start)
+            self._check(count, "newton")
+            errors, count = self._errors(errors.start), count + 1
         return errors
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
@@ -398,8 +403,8 @@ class Newton:
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
-            where, what = ("storage: a source", size) if np.isfinite(r.norm()) else ("momentum: a law or term", norm)
-            raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
+            where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
+            raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
         self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 

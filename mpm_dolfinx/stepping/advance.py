@@ -45,7 +45,7 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay, Trend
 
 TAKES_IN = 0.1
-"""Rate of correction of the points' volume defect `owed`, per cell size that corners move in their part of the bodies.
+"""Rate of correction of the points' volume defect `owed`, per cell size of corner motion in their connected part.
 
 The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With 0,
 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress. From 0.2 on,
@@ -113,7 +113,7 @@ class Motion:
         stays
             Whether points that hardly move may keep their pieces.
         carried
-            Function for the points' velocities, of their motion (n,) in cell sizes, 0 without reset: `Mass.carried`.
+            Function of the points' motion (n,), in cell sizes, 0 without reset: their new velocities, `Mass.carried`.
 
         Raises
         ------

@@ -146,7 +146,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points are at true positions, must count from the grid's base: points.from_base")
+            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property
