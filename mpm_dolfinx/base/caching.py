@@ -67,7 +67,12 @@ def same(a: Any, b: Any) -> bool:
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(map(same, a, b))
+        if len(a) != len(b):
+            return False
+        for one, other in zip(a, b, strict=True):
+            if one is not other and not same(one, other):
+                return False
+        return True
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.shape == b.shape and bool(np.logical_and.reduce(a == b, axis=None))
     return not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and bool(a == b)

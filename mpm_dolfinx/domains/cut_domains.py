@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from math import prod
 
 from mpi4py import MPI
 
@@ -165,9 +166,9 @@ class CutDomains(Keyed):
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return for each point the volume mean (n, ...) of values (m, ...) of its pieces."""
-        columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
-        means = [sum_by(self.pieces.point, self.pieces.fraction * column, len(self.points)) for column in columns]
-        return np.stack(means, axis=1).reshape(len(self.points), *values.shape[1:])
+        columns = values.reshape(len(values), prod(values.shape[1:])).T
+        means = sum_by(self.pieces.point, self.pieces.fraction * columns, len(self.points))
+        return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return means as in `mean` for values at centroids in the plane; in axisymmetry weighted by area."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache, cached_property, partial, reduce
+from math import prod
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -59,11 +60,11 @@ def in_chunks(count: int) -> list[slice]:
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the sums (..., size) of values (..., n) by index (n,), as floats (`np.bincount` may return ints)."""
-    if values.ndim > 1:
-        rows = values.reshape(int(np.prod(values.shape[:-1])), len(index))  # also for no rows
-        index, whole = (index + size * np.arange(len(rows))[:, None]).ravel(), size * len(rows)
-        return sum_by(index, rows.ravel(), whole).reshape(*values.shape[:-1], size)
-    return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
+    shape = values.shape[:-1]
+    if shape:
+        index = (index + size * np.arange(prod(shape))[:, None]).ravel()
+    sums = np.bincount(index, weights=values.ravel(), minlength=size * prod(shape))
+    return sums.astype(float, copy=False).reshape(*shape, size)
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

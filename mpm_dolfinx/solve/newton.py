@@ -458,19 +458,21 @@ class Newton:
         """Move u and p against the direction; the line search sets the step length of each part; return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        first = np.full(of.count, np.nan) if elastic else self._work()  # without yield it is not used
-        if (first < 0).any():
+        moved = np.zeros(of.count)
+        steps = moved + 1.0
+        first = moved if elastic else self._work()  # without yield it is not used
+        if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
         start = Halving() if elastic else Search()
         searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], start)
-        steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
             growth, work = errors.each / before.each, first if elastic else self._work()
             for part, search in list(searches.items()):
-                then = search.after(np.nan if why else _ratio(work[part], first[part]), growth[part])
+                ratio = np.nan if why or elastic else _ratio(work[part], first[part])
+                then = search.after(ratio, growth[part])
                 if then is not None:
                     searches[part], steps[part] = then, then.step
                 elif growth[part] <= search.limit:
