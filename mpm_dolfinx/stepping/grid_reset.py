@@ -410,9 +410,9 @@ class OnGrid(Keyed):
     def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return which points (n,) keep their pieces: their connected part hardly moves. Groups are tested together."""
         all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
-        if all_of_them or self.cut.grid.copies > 1:
+        part, count = (0, 1) if all_of_them or self.cut.grid.copies > 1 else self.parts
+        if count == 1:
             return np.full(len(points), all_of_them)
-        part, count = self.parts
         return self.cut.valid(points, part, count)[part]
 
     @cached_property
