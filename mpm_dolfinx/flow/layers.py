@@ -102,9 +102,10 @@ class MixedCells:
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
-        x, low, high = self._x[line], low[piece], high[piece]
+        x = self._x[line]
+        low, high = low[piece], high[piece]
         # means of lines on both sides, because a border of pieces along a line lies there only within rounding
-        inside = np.mean([(low <= beside) & (beside <= high) for beside in (x - NEAR / 2, x + NEAR / 2)], axis=0)
+        inside = np.mean([(low <= place) & (place <= high) for place in (x - NEAR / 2, x + NEAR / 2)], axis=0)
         out = []
         for axis in range(self._x.shape[1]):
             fraction = np.delete(inside, axis, axis=1).prod(axis=1)
