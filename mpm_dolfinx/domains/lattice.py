@@ -168,8 +168,8 @@ def _change(
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]
-            apart = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
-            field[sites[np.logical_or.reduce(apart.T)]] = np.nan
+            differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
+            field[sites[np.logical_or.reduce(differs.T)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # the part of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
