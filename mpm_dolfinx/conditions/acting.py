@@ -97,12 +97,13 @@ class Setting:
 class Place(NamedTuple):
     """Place and time of a condition in a substep.
 
-    cut: cut particle domains; points: present points; pieces: quadrature points, see `QuadratureData`; start, dt: start
-    and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether the bodies
-    have inertia.
+    cut: cut particle domains; fill: volume fraction of the local cells; points: present points; pieces: quadrature
+    points, see `QuadratureData`; start, dt: start and length of the step, s; t: end of the substep, s; before: outcome
+    of the last step; inertia: whether the bodies have inertia.
     """
 
     cut: CutDomains
+    fill: NDArray[np.float64]
     points: MaterialPoints
     pieces: Any
     start: float

@@ -5,19 +5,26 @@ A Q1 field has too few nodal displacements in a cell to meet constraints at many
 each of them would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero
 mean in each cell. The present traction of the body, rotated with the side, is applied explicitly. Both penalties then
 carry the traction increment of the step only, and their gap is smaller by that factor.
+
+A side that has come to a grid line is never quite flat: some of its cells are nearly empty. Their rows, and those of
+the inner cells, would ask different motions of the nodes on the line. Only the nodes beyond it could meet both, and
+nothing resists these: the side would drift. An inner cell that also holds the side therefore holds this part too (cell
+aggregation; Badia, Verdugo and Martin 2018).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.conditions.conditions import HOLD, WEAK
 from mpm_dolfinx.grid.grid import Grid, among, sum_by
+from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
@@ -57,6 +64,41 @@ class HeldPoints(NamedTuple):
     given: NDArray[np.float64]
     normal: NDArray[np.float64]
     force: NDArray[np.float64]
+
+
+def inner_cells(
+    grid: Grid,
+    fill: NDArray[np.float64],
+    number: NDArray[np.int64],
+    cell: NDArray[np.int32],
+    normal: NDArray[np.float64],
+    axes: Sequence[int | None],
+) -> NDArray[np.int64]:
+    """Return the local cells (n,) that hold points of sides: inner cells instead of nearly empty ones.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    fill : (cells,)
+        Volume fraction of the local cells.
+    number, cell, normal : (n,), (n,), (n, d)
+        Condition, owned cell, and outward area vector of the points.
+    axes : (conditions,)
+        Normal axes of the sides along the grid; the other sides, None, stay in their cells.
+    """
+    inner = cell.astype(np.int64)
+    for k, axis in enumerate(axes):
+        if axis is None:
+            continue
+        own, holds = (number == k).nonzero()[0], fem.Function(grid.cellwise()).x
+        holds.array[cell[own]] = 1.0
+        holds.scatter_forward()
+        ends = (normal[own, axis] < 0).astype(np.int64)
+        behind = grid.neighbours(cell[own])[np.arange(len(own)), axis, ends]
+        moves = (behind >= 0) & (holds.array[behind] > 0) & (fill[cell[own]] < RATIO * fill[behind])
+        inner[own[moves]] = behind[moves]
+    return inner
 
 
 class HeldCells:
