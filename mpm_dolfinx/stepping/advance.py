@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The end of a step: particle domains move with the grid, F follows from their corners, and pieces carry the pressures.
+"""End of a step: particle domains move with the grid, F follows from their corners, pieces store the pressures.
 
-The grid itself is reset at the start of the next step, see `grid_reset`.
+The grid is reset at the start of the next step, see `grid_reset`.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay
 
 TAKES_IN = 0.1
-"""Rate of correction of the volume defect `owed` of points, per cell of corner motion in their part of the bodies.
+"""Rate of correction of the points' volume defect `owed`, per cell size that corners move in their part of the bodies.
 
-The mean defect of an undrained part without sources is corrected at once: such a part keeps its volume. With 0, 0.1,
-0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress. From 0.2 on
-pressures of a manufactured solution converge with less than order 1.75. Without motion there is no correction, so it
-does not affect the order in time. The mean of drained parts must stay: a column under a varying gravity then has order
-1.2 in the step.
+The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With 0,
+0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress. From 0.2 on,
+pressures of a manufactured solution converge with an order below 1.75. Without motion there is no correction, so the
+order in time is unaffected. The mean defect of drained parts is not corrected: with a correction, a column under
+varying gravity has order 1.2 in the step.
 
-Plateau (beam): halved 1.7e-03, doubled 2.8e-03, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 1.7e-03, twice by 2.8e-03, finer cells by 1.5e-02.
 """
 
 
 class Motion:
-    """Moves the points of a scene.
+    """Motion of a scene's material points in a step.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Motion:
     bodies
         All bodies of the scene.
     momentum, storage
-        Forms of the two problems, with u and p of a solved step; storage is None without fluid.
+        Forms of the two balances, with u and p of a solved step; storage is None without fluid.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Motion:
         stays: bool = True,
         carried: Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None = None,
     ) -> tuple[State, int]:
-        """Return the state at time t (s) after a solved step, and the number of inverted domains.
+        """Return the state at time t, s, after a solved step, and the number of inverted domains.
 
         Parameters
         ----------
@@ -105,18 +105,18 @@ class Motion:
         loads
             Loads at the end of the step.
         net_inflow : (n,), m^d
-            Net fluid inflow into the filled owned cells in the step; None leaves the points' volume defect unchanged.
+            Net inflow of fluid into the filled owned cells in the step; None leaves the volume defect unchanged.
         report
             Report of the step, for the exception if a point leaves the grid.
         stays
-            Whether pieces may stay in their cells where points hardly move.
+            Whether points that hardly move may keep their pieces.
         carried
-            Function of the motion (n,) of points in cells, 0 without reset, for their velocities; see `Mass.carried`.
+            Function for the points' velocities, of their motion (n,) in cell sizes, 0 without reset: `Mass.carried`.
 
         Raises
         ------
         NotConverged
-            A point is inverted, or its pores have closed.
+            A point is inverted, or its pores are closed.
         LeftGrid
             A point has left the grid.
         """
@@ -170,9 +170,9 @@ class Motion:
         return new, folded
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
-        """Return a function for the hydrostatic pressures, Pa, at time t (s), up to a constant.
+        """Return a function for the hydrostatic pressures, Pa, at time t, s, up to a constant.
 
-        None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the cut.
+        None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the domains were cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None or self._storage.fluxes.flux is None:
@@ -183,7 +183,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return nodal values, a local array, at nodes of parts whose points (n,) all stay; zero at other nodes."""
+        """Return nodal values, a local array, at nodes of parts in which all points keep their pieces; else zero."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -193,7 +193,7 @@ class Motion:
     def pressures(
         self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, of the points from the pressures of the cells at time t (s).
+        """Return the pressures (n,), Pa, of the points from the pressures of the cells at time t, s.
 
         nodal (nodes, d), m: displacement since the reset of the grid, if any.
         """
@@ -201,14 +201,14 @@ class Motion:
         return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
 
     def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return points with F and state after a solved step of zero length, at unchanged positions."""
+        """Return the points with F and state after a solved step of zero length, at unchanged positions."""
         nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
         after = self._dried(points.strained(self._deformed(on_grid.cut, data, nodal)), on_grid, data)
         self._check_volumes(after, on_grid.cut)
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _dried(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return points with the suction of their pieces, which are means over them, where laws see it."""
+        """Return the points with their suction, averaged over the pieces of each domain, if laws depend on it."""
         if self._storage is None or "suction" not in self._materials.state_names:
             return points
         cut, pieces = on_grid.cut, data.pieces
@@ -217,9 +217,9 @@ class Motion:
         return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step: the mean of Delta F over the pieces, with the mean of det.
+        """Return F (n, d, d) of the points after a step: mean of Delta F over the pieces, scaled to the mean of det.
 
-        It has the shape of the laws' F.
+        The shape is that of the laws' F.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -253,14 +253,14 @@ class Motion:
         bend: NDArray[np.float64],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with corners moved (n, 2^d, d), m, plus a quadratic correction `bend`, and their F.
+        """Return the points with corners moved by `moved` (n, 2^d, d), m, and the quadratic correction `bend`; their F.
 
-        Where Q1 cells would lock, F takes the volume ratio of the cells from `deformed`. Yielded soil takes all of F
-        from it: its deformation does not return, and domains in kinks would give wrong values.
+        If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`:
+        the deformation there is permanent, and domains in kinks would give wrong values.
 
         Returns
         -------
-        The points; whether each (n,) is still at its position in the cut; number of inverted domains.
+        The points; whether each point (n,) is still at the position at which it was cut; number of inverted domains.
         """
         cut = on_grid.cut
         stage = state.stage
@@ -304,11 +304,11 @@ class Motion:
         net_inflow: NDArray[np.float64],
         keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the volume defect of the points after a step (n,), over reference volumes, and the part `due`.
+        """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The defect is the growth of their content, from volumes and cell pressures, beyond the net inflow: a mass over
-        the density at zero pressure. Soil with a free surface has none: drained water is not in this content. Points
-        that stay in their cut (n,) have no correction `due`.
+        The defect is the increase of their fluid content, from volumes and cell pressures, minus the net inflow, as
+        fluid mass / density at zero pressure. Soil with a free surface has no defect, because its content excludes
+        drained water. Points with keeps (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut
@@ -342,31 +342,31 @@ class Motion:
     def _means(
         self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the weighted means (count,) of values over each part's points, zero for parts without points."""
+        """Return the weighted mean (count,) of the values of each part's points; zero for parts without points."""
         sums = np.stack([sum_by(part, column, count) for column in (weight * values, weight)])
         total, whole = over_all(self._momentum.grid.comm, sums)
         return np.divide(total, whole, out=np.zeros(count), where=whole > 0)
 
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
-        """Return the parts (count,) without open sides, and without sources at the end of the step."""
+        """Return which parts (count,) have no open sides, and no sources at the end of the step."""
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
         return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's body (n,)."""
+        """Return the index of each point's body (n,)."""
         return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of boxes with the reference volume of the points' domains."""
+        """Return the edges (n, d), m, of boxes with the reference volumes of the points' domains."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
         size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:
-        """Refuse states that a law may allow but a body cannot have: inverted points, pores without volume."""
+        """Raise NotConverged for states that a body cannot have: inverted points, pores without volume."""
         wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = (~(J > least)).nonzero()[0]
@@ -376,7 +376,7 @@ class Motion:
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
-        """Return a state whose points carry the pressures of their pieces: the next step resets the grid."""
+        """Return a state in which points store the pressures of their pieces: the next step resets the grid."""
         carried, points = state.pieces, state.points
         if self._storage is not None:
             with _compat.Timer("remap"):
@@ -399,7 +399,7 @@ class Motion:
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
-    """Refuse points with a corner outside the grid, and report the worst one."""
+    """Raise LeftGrid if a corner of a point is outside the grid; the message states the farthest corner."""
     grid = cut.grid
     x = points.corners if cut.domains else points.x[:, None]
     message = ""
@@ -423,7 +423,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m; corners of inverted domains are re-initialised from F."""
+    """Return corners (n, 2^d, d), m; corners of inverted domains (bad) are re-initialised from F."""
     at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim
