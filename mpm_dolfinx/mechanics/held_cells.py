@@ -83,12 +83,12 @@ def inner_cells(
         axis = (extent / grid.finest).argmin()
         if axis not in axes or extent[axis] > ALIGNED * grid.finest[axis]:
             continue
-        own, holds = (number == k).nonzero()[0], fem.Function(grid.cellwise()).x
-        holds.array[cell[own]] = 1.0
-        holds.scatter_forward()
-        behind = grid.neighbours(cell[own])[np.arange(len(own)), axis, (normal[own, axis] < 0).astype(int)]
-        moves = (behind >= 0) & (holds.array[behind] > 0) & (fill[cell[own]] < RATIO * fill[behind])
-        inner[own[moves]] = behind[moves]
+        own, side = (number == k).nonzero()[0], fem.Function(grid.cellwise()).x
+        side.array[cell[own]] = 1.0
+        side.scatter_forward()
+        neighbour = grid.neighbours(cell[own])[np.arange(len(own)), axis, (normal[own, axis] < 0).astype(int)]
+        aggregated = (neighbour >= 0) & (side.array[neighbour] > 0) & (fill[cell[own]] < RATIO * fill[neighbour])
+        inner[own[aggregated]] = neighbour[aggregated]
     return inner
 
 
