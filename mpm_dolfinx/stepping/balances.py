@@ -151,6 +151,8 @@ def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] 
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
         return substep.end / substep.own * scene.momentum.u.x.array
+    if start.state.trend is not None and not leads(scene, acting.loads):
+        return scene.motion.ahead(start.on_grid, start.state, float(substep.end * start.dt))
     velocity = start.state.velocity if substep.before == 0.0 else None
     return None if velocity is None else substep.end * start.dt * velocity
 

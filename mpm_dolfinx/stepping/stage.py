@@ -230,7 +230,7 @@ def stage(
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
     if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
-        raise ValueError("drained and inflow sides need a fluid")
+        raise ValueError("conditions: drained or inflow sides without fluid, must be in a scene with fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -293,7 +293,7 @@ def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
     if not isinstance(walls, Mapping):
-        raise ValueError(f"walls = {line(walls)}, must be walls with their components, such as {{'left': 'xy'}}")
+        raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
     for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
             raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
