@@ -423,7 +423,8 @@ def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArr
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
-    place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
+    at = start.on_grid.cut, start.on_grid.fill, state.points, data
+    place = Place(*at, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
     when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
     return scene.balance(when, matrices.momentum, data, loads, 0.0)
