@@ -241,10 +241,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed by a condition or fixed by a wall.
-
-    `walls` are the fixed components of each wall, by name.
-    """
+    """Return which components (n, 2^d, d) of corners a condition prescribes, or `walls` (name -> components) fix."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
