@@ -158,7 +158,8 @@ def begin_stage(
         points = replace(points, origin=points.corners)
     outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(after, before) else None
-    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest, "trend": None}
+    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    new["trend"] = None if add or remove else state.trend
     return replace(state, points=points, pieces=pieces, **new)
 
 
