@@ -36,19 +36,19 @@ MOST, HALVINGS = 60, 25  # Newton iterations, and step halvings in all iteration
 
 
 class Solved(NamedTuple):
-    """Solution at some points: key of their data; unknowns (n, m); trial values (n, k); function for derivatives."""
+    """Solution of the local equations at n points."""
 
-    key: object
-    unknowns: NDArray[np.float64]
-    trial: NDArray[np.float64]
-    derive: Callable[[], Derived]
+    key: object  # of the points' data
+    unknowns: NDArray[np.float64]  # (n, m)
+    trial: NDArray[np.float64]  # trial values (n, k)
+    derive: Callable[[], Derived]  # function that returns the derivatives
 
 
 class Derived(NamedTuple):
-    """Derivatives with respect to the trial values: slopes Y (n, m k); for laws with an energy bends (n, m k k)."""
+    """Derivatives of the unknowns with respect to the trial values, at n points."""
 
-    slopes: NDArray[np.float64]
-    bends: NDArray[np.float64] | None = None
+    slopes: NDArray[np.float64]  # first derivatives Y (n, m k)
+    bends: NDArray[np.float64] | None = None  # second derivatives (n, m k k), for laws with an energy
 
 
 class LocalUnknowns:

@@ -38,27 +38,20 @@ CARRIED = 0.3  # largest plausible traction increment of a step / (resisting mod
 
 
 class HeldPoints(NamedTuple):
-    """Integration points on sides with prescribed displacements; arrays for n points in owned cells.
+    """Integration points on sides with prescribed displacements; arrays for n points in owned cells."""
 
-    number, cell (n,): condition and local cell; area (n,): reference area, m^(d-1); x (n, d): position, m.
-    gap (n, d): prescribed minus present position, m; given (n, 2 d): prescribed displacements at both ends of the step.
-    modulus, tension, resistance, firm (n,): penalty modulus, norm of the stress, resisting modulus and confined modulus
-    at the last reset of the grid, all times area, N.
-    normal (n, d): area vector at the last reset, m^(d-1); force (n, d): present force, rotated with the side, N.
-    """
-
-    number: NDArray[np.int64]
-    cell: NDArray[np.int32]
-    area: NDArray[np.float64]
-    modulus: NDArray[np.float64]
-    tension: NDArray[np.float64]
-    resistance: NDArray[np.float64]
-    firm: NDArray[np.float64]
-    x: NDArray[np.float64]
-    gap: NDArray[np.float64]
-    given: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    force: NDArray[np.float64]
+    number: NDArray[np.int64]  # (n,) index of the condition
+    cell: NDArray[np.int32]  # (n,) local cell
+    area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N, at the last reset of the grid, as the next three
+    tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
+    resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
+    firm: NDArray[np.float64]  # (n,) confined modulus times area, N
+    x: NDArray[np.float64]  # (n, d) position, m
+    gap: NDArray[np.float64]  # (n, d) prescribed minus present position, m
+    given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
+    normal: NDArray[np.float64]  # (n, d) area vector at the last reset of the grid, m^(d-1)
+    force: NDArray[np.float64]  # (n, d) present force, rotated with the side, N
 
 
 def inner_cells(
