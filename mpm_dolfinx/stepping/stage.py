@@ -229,8 +229,9 @@ def stage(
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
-    if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
-        raise ValueError("drained and inflow sides need a fluid")
+    for name, one in by_name.items():
+        if fluid is None and (isinstance(one, wet) or hasattr(one, "feeding")):
+            raise ValueError(f"{name}: {line(one)}, must be in a scene with a fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
