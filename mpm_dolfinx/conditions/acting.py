@@ -150,7 +150,7 @@ class Loads:
     """Key of everything on which the penalty depends, except for the positions of faces."""
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
-        """Return the loads for a substep with inertia.  `gone` is the result of `flown` in the previous substep."""
+        """Return the loads for a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""
         return self
 
     def flown(self, at: At) -> Any:
@@ -220,7 +220,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local degrees of freedom (n,) on walls, unrolled, and forces (n,), N, there that no wall exerts."""
+        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on them that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def touching(self) -> tuple | None:
@@ -235,10 +235,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors (cells,), N, of forces in local cells, including this condition.
-
-        `of_cells` are the errors without it.
-        """
+        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` leave out this condition."""
         return of_cells
 
     @property

@@ -95,10 +95,10 @@ class Traction(Condition):
 class Pressure(Condition):
     """Pressure on a side of the bodies that follows the surface: normal to the surface, per current area.
 
-    It adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the pores,
-    `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is closed, or
-    ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the stability of
-    dry equilibria is not checked.
+    The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
+    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is
+    closed, or ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the
+    stability of dry equilibria is not checked.
 
     Parameters
     ----------
@@ -128,10 +128,10 @@ class Pressure(Condition):
 class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
-    The traction resists the velocity.  It is the velocity times the impedance of the material, rho c_p along the normal
-    and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few per cent
-    are reflected.  A side that was fixed in a stage without inertia keeps its tractions.
-    Bodies with weight need such a stage.
+    The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
+    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few
+    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies
+    with weight need such a stage.
 
     Parameters
     ----------

@@ -56,7 +56,8 @@ class Pushes:
 class LinearMotion:
     """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-    They are motion + shift + sum slope . (w' - w), with the sum over the pairs of a tool.  Newton's method uses them.
+    The displacements are motion + shift + sum slope . (w' - w); the sum is over the pairs of a tool.  Newton's method
+    uses this line.
     """
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m

@@ -168,13 +168,14 @@ def _change(
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]
-            field[sites[(np.abs(field[sites] - d[part]) > tolerance).any(axis=1)]] = np.nan
+            apart = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
+            field[sites[np.logical_or.reduce(apart.T)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # the part of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
     change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
     change[np.isnan(change)] = 0.0
-    return exchange.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
+    return exchange.back(change.reshape(-1, values.shape[1] - 1).take(rows[0][0], axis=0))
 
 
 def _filtered(

@@ -17,6 +17,7 @@ neighbours.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ class Gradients:
         along[:, np.arange(2 * d), towards] = 0.0
         h = grid.sizes(contents.filled)
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
-        off[at[(np.abs(tangential / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
+        off[at[_off_middle(sides, tangential / grid.sizes(sides.cells))]] = True
         self.rows = rows = np.flatnonzero(off)
         """Indices of the cells that need the correction, among the filled cells."""
         distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
@@ -98,10 +99,7 @@ class Gradients:
         self._tangential = tangential[self._faces]
         self._normal = normal[self._faces]
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
-        size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
-        at_sides = self._at[self._known]
-        weight = SIDES * size / sum_by(at_sides, size, len(rows))[at_sides]
-        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight)
+        self._contents, self._sides = contents, sides
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
         """Return the area vectors (n, d) of no-flow sides in the filled cells, relative to the faces of the cell."""
@@ -112,12 +110,13 @@ class Gradients:
             out[:, axis] -= area * grid.along(contents.filled, axis) / grid.volumes(contents.filled)
         return np.where(np.linalg.norm(out, axis=1, keepdims=True) > ALONG, out, 0.0)
 
-    def _units(
-        self, sealed: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return gradients (n, 2 d, d) and (m, d), 1/m, for a unit difference to one neighbour or to one side."""
+    @cached_property
+    def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gradients (n, 2 d, d) and (m, d), 1/m, for a unit difference to one neighbour or to one side."""
         known, d = self._known, self._separation.shape[2]
-        at = self._at[known]
+        at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
+        size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
+        weight = SIDES * size / sum_by(at, size, len(self.rows))[at]
         offset = self._offset[known]
         near = np.broadcast_to((NEAREST * self._grid.sizes(self._own).min(axis=-1)) ** 2, len(self._own))
         squared = np.maximum((self._separation**2).sum(axis=2), near[:, None])
@@ -146,15 +145,16 @@ class Gradients:
         weight : (d,), N/m^3
             Unit weight of the fluid; None without gravity.
         """
+        of_cells, of_sides = self._units
         own, at = p[self._own], self._at[self._known]
         to_cells = p[self._neighbours] - own[:, None]
         to_sides = outer[self._faces[self._known]] - own[at]
         if weight is not None:
             to_cells, to_sides = to_cells - self._separation @ weight, to_sides - self._offset[self._known] @ weight
         to_cells = np.where(self._inside, to_cells, 0.0)
-        out = np.einsum("nk,nki->ni", to_cells, self._of_cells)
+        out = np.einsum("nk,nki->ni", to_cells, of_cells)
         for axis in range(out.shape[1]):
-            out[:, axis] += sum_by(at, to_sides * self._of_sides[:, axis], len(out))
+            out[:, axis] += sum_by(at, to_sides * of_sides[:, axis], len(out))
         low, high = to_cells.min(axis=1, initial=0.0), to_cells.max(axis=1, initial=0.0)
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
@@ -188,8 +188,25 @@ class NonorthogonalFlow(NamedTuple):
         The corrections apply to the cell pressure at open sides.  `p` (c,), Pa, are the pressures of the local cells;
         `bulk`, Pa, is the bulk modulus of the fluid.
         """
-        slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active
+        if not self.facets.some and not len(self.gradients.rows):
+            return np.zeros(len(filled)), np.zeros(len(self.sides.cells))
+        slope = self.gradients(p, self.sides.pressure, self.weight)
+        through = self.gradients.through_sides(slope, len(self.sides.cells))
+        if not self.facets.some:
+            return np.zeros(len(filled)), through
         density = np.exp(p[active] / bulk)
         outflow = self.forms.along(slope, filled[self.gradients.rows], self.facets, active, density)
-        return outflow[filled], self.gradients.through_sides(slope, len(self.sides.cells))
+        return outflow[filled], through
+
+
+def _off_middle(sides: OpenSides, off: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for each face (m,) whether the faces of its condition in its cell are offset from the cell's centroid.
+
+    `off` (m, d), in cells, are vectors along the faces from the foot of the centroid.  The faces' mean vector decides.
+    """
+    _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
+    at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
+    count = int(at.max(initial=-1)) + 1
+    mean = sum_by(at, (size[:, None] * off).T, count) / sum_by(at, size, count)
+    return (np.abs(mean) > ALONG).any(axis=0)[at]

@@ -530,10 +530,7 @@ class Grid:
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the factor from plane to volume integrals at positions x (n, d), m: 2 pi r (n,), m, or 1.
-
-        It is 2 pi r in axisymmetry.
-        """
+        """Return the factor from plane to volume integrals at x (n, d), m: 2 pi r (n,), m, in axisymmetry, else 1."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -192,12 +192,12 @@ class SceneMaterials:
         if "suction" in law.state and self.fluid is not None and m.retention is None:
             raise ValueError(f"{law.__name__}: retention = None, must be a retention curve for a law with suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
-            what = "has unknowns and takes cell_size, must not with cells of several sizes"
+            what = "has unknowns and depends on cell_size, must not be used with cells of several sizes"
             raise ValueError(f"{law.__name__}: {what}")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*constants_of(m), *law.state])
-                raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
+                raise ValueError(f"{law.__name__}: argument {name!r} of its functions, must be F or one of {known}")
             value = _known(f"{law.__name__}: {name}", getattr(m, name))
             self._set_shape(law, name, value.shape[1:])
         for name, value in law.state.items():
@@ -304,7 +304,7 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,): values at the points.
 
-        `value` returns one value per point, or a single value for a uniform material without columns.
+        `value` returns one value per point, or one number; for a uniform material without columns also one value (...).
         """
         each, shapes = [], set()
         for i in self._used:

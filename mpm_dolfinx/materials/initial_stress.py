@@ -202,10 +202,10 @@ class InitialStresses:
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
             g = None if gravity is None else np.asarray(gravity).tolist()
-            raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, must point down along the last axis at the start")
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
-            raise ValueError("initial_stress: K0 without gravity at the start, nor a surcharge: must have one of these")
+            raise ValueError("initial_stress: K0 without gravity at the start or surcharge, must have one of them")
         # the densities of all points on all processes
         seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.present_density(seeded)
@@ -222,8 +222,7 @@ def stressed(
 ) -> MaterialPoints:
     """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter; in other laws elastic strain causes it, see
-    `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter; in other laws elastic strain: `_ElasticStrains`.
 
     Raises
     ------

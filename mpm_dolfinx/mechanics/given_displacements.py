@@ -137,7 +137,7 @@ class GivenDisplacements(Acting):
             if wrong >= 0:
                 hold, x = self._holds[held.number[wrong]][0], held.x[wrong] + self._grid.base
                 what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
-                message = f"{what}, where a wall of the grid fixes it; must be 0 there, or the wall must leave it free"
+                message = f"{what}, which a wall of the grid fixes there; must be 0 there, or free at the wall"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
@@ -186,7 +186,7 @@ class GivenDisplacements(Acting):
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
             if jump.max(initial=0.0) > NEAR * self._grid.least:
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
-                raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or be two cells apart")
+                raise ValueError(f"{what}, at {X[jump.argmax()]}; must be equal there, or the sides two cells apart")
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
@@ -374,7 +374,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding error of nodal forces with that of the penalty: stiffness times error of coordinates."""
+        """Return the rounding error of nodal forces, with the penalty's: stiffness times the error of coordinates."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

@@ -75,8 +75,8 @@ class HeldCells:
         Condition, cell, mean position, m, mean shape functions, and mean products of the distances from the cell's
         midpoint, m, for each penalty.
     stiffness, limit
-        Penalty stiffness of each component, N/m; along the normal of a side parallel to the grid from the confined
-        modulus.  Largest plausible force of each mean, N; larger forces are artefacts.
+        Penalty stiffness of each component, N/m, from the confined modulus along the normal of a side parallel to the
+        grid.  Largest plausible force of each mean, N; larger forces are artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -134,7 +134,7 @@ class HeldCells:
         Where a side meets a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. If a side moves at such a wall by more
         than half of its displacement in the cell, its displacement must vary over this cell. This is checked at the
-        start and the end of the step. The penalty is dropped if others already hold some of the cell's free nodes.
+        start and the end of the step. The penalty is then omitted if other penalties hold a free node of the cell.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class HeldCells:
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the conditions whose force exceeds its limit, with the position (d,), m, of the largest excess.
 
-        A Q1 field cannot always meet the means of two neighbouring cells, as for a side along a grid line. The
+        A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
         penalties then push the side to and fro. Only the sum of their forces at the nodes acts on the body and counts
         in the reaction. A penalty thus exceeds its limit only if its own force and the condition's nodal forces do.
 

@@ -395,7 +395,7 @@ class MomentumProblem:
     tolerance
         Tolerance of the residual, relative to the forces.
     goes_on : (unknowns,)
-        Displacements extrapolated from the last step, m, a local array; None if there is no last step.
+        Displacements extrapolated from the last step, m, a local array; None if unknown.
     held : (unknowns,)
         Forces that balance the initial stress where loads do not, N, a local array, or None.
     yielded

@@ -32,8 +32,8 @@ STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 at 0.47.
 
 The difference between corner-based ratio and Q1 field expels water from such skeletons in every step of any length.
-With a weight of 1 and eight cells over a beam's depth, its extreme pressures have errors of 43 % at nu = 0.49. At
-0.499 they are six to thirty times too large, and adaptive steps never grow.
+With a weight of 1 and eight cells over the depth, extreme pressures of a beam have errors of 43 % at nu = 0.49. At
+0.499 the pressures are six to thirty times too large, and adaptive steps never grow.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.

@@ -68,8 +68,7 @@ class Active:
     slot : (cells,)
         Index of each cell among the owned active cells.
     centroid, opening : (cells, d), (cells, d, 2)
-        Offsets of the material's centroids from the cells' midpoints, m; open fractions of faces.  Empty without fluid,
-        as is `slot`.
+        Offsets of the material's centroids from the cells' midpoints, m; open fractions of faces.  Empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):

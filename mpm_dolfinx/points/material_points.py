@@ -72,7 +72,7 @@ def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return det F F^-T (n, d, d) of F (n, d, d); numpy's inverse takes ten times as long."""
     if F.shape[1] == 2:
-        flat = F.reshape(-1, 4)[:, [3, 2, 1, 0]] * [1.0, -1.0, -1.0, 1.0]
+        flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
     return np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
 

@@ -131,7 +131,7 @@ class Events:
         if error is not None:
             raise error
         if where:
-            raise RuntimeError(f"until: has raised an error on {where}")
+            raise RuntimeError(f"until: a function raised an error on {where}")
         given = comm.allgather(out)
         for rank, other in enumerate(given):
             if other != given[0]:

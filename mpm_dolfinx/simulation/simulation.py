@@ -186,8 +186,7 @@ class Simulation:
     def reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain), in the last step.
 
-        In axisymmetry it acts on the full circumference; the radial force is the sum of outward forces. Before the
-        first step of a stage it is nan.
+        In axisymmetry for the full circumference, radial forces outward; nan before the first step of a stage.
         """
         return self.outcome("reactions")
 

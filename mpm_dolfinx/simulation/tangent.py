@@ -51,7 +51,7 @@ class Tangent:
 
 
 def tangent(simulation: Simulated, dt: float) -> Tangent:
-    """Return the tangent at the present state, for a step of dt, s, > 0, that starts now; see `Tangent`.
+    """Return the tangent at the present state; dt: length of the step that starts now, s, > 0; see `Tangent`.
 
     Raises
     ------

@@ -186,8 +186,7 @@ def _shared(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers (n,) of coarse unknowns, NONE for other candidates, and whether this process owns them (n,).
 
-    The process of lowest rank with a candidate owns the unknown. Owners and numbers are found on processes to which the
-    keys are distributed.
+    The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
     Parameters
     ----------

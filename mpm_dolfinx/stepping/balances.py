@@ -51,7 +51,7 @@ class Start(NamedTuple):
     renewed: int = 0
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep; gone: their data from the previous substep."""
+        """Return the loads at the beginning of a substep; earlier: their data from the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
@@ -151,6 +151,8 @@ def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] 
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
         return substep.end / substep.own * scene.momentum.u.x.array
+    if start.state.trend is not None and not leads(scene, acting.loads):
+        return scene.motion.ahead(start.on_grid, start.state, float(substep.end * start.dt))
     velocity = start.state.velocity if substep.before == 0.0 else None
     return None if velocity is None else substep.end * start.dt * velocity
 

@@ -176,7 +176,6 @@ class OnGrid(Keyed):
         """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
 
         The mass potentials pi (m,), Pa, preserve linear fields; a constant for each point corrects their pressures.
-        water.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -409,11 +408,11 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) keep their pieces, as their part hardly moves; groups are tested together."""
+        """Return which points (n,) keep their pieces: their connected part hardly moves. Groups are tested together."""
         all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
-        if all_of_them or self.cut.grid.copies > 1:
+        part, count = (0, 1) if all_of_them or self.cut.grid.copies > 1 else self.parts
+        if count == 1:
             return np.full(len(points), all_of_them)
-        part, count = self.parts
         return self.cut.valid(points, part, count)[part]
 
     @cached_property
@@ -539,8 +538,7 @@ class Assembled(Keyed):
         if self.storage is not None:
             self.storage.set_alternation()
             if (form := storage.fluxes.nonorthogonal) is not None:
-                facets = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
-                self._off = facets if facets.some else None
+                self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
         self._gradients: Latest[Gradients] = Latest()
 
     @property

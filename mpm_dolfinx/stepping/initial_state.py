@@ -54,7 +54,7 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Iterations that are mixed; iterations, PATIENCE, without reduction of the residual by the factor LESS to end.
+"""Number of mixed iterations; the iteration ends after PATIENCE iterations that do not reduce the residual by LESS.
 
 Tests: a wet bank, elastic or frictional, blocks on a rough base, one of them half supported. With 40 and 16 and with 80
 and 24 the remaining forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 up to 6e-3.
@@ -73,7 +73,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     first = _stage(scene, conditions, present, later)
     if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
-            f"{next(iter(quiet))}: cannot hold an initial stress, must begin a stage later: first prescribe the side"
+            f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
         )
     _check_weight(first, None, 0.0)
     if hasattr(scene.grid.follow, "pose") and followed_tool(scene.grid, first.given) is None:
@@ -144,7 +144,7 @@ def begin_stage(
         gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
         what = f"stage: add: body {add[0]}: domains of others have been renewed"
-        raise ValueError(f"{what}, must come before, or without Numerics(renewal=True)")
+        raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
     others = before.data_names(before.named.keys() - after.same(before))
@@ -163,7 +163,7 @@ def begin_stage(
         points = replace(points, origin=points.corners)
     outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(after, before) else None
-    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest, "trend": None}
     return replace(state, points=points, pieces=pieces, **new)
 
 
@@ -209,7 +209,7 @@ def _gripped(
     """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
-        raise ValueError(f"{clashes[0]!r}: points have data of this name, must be another name of a condition")
+        raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
     if before is not None:
         known, at = before.find(points.id)
         for name in kept.keys() & before.data.keys():
@@ -246,7 +246,7 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
     """Return the conditions with the scene's contacts, which stages cannot change."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and given != standing:
-        raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
+        raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
     return [*conditions, *(() if given else standing)]
 
 
@@ -276,7 +276,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points with added bodies, and the points of these bodies alone; a body follows the body it lies on."""
+    """Return all points with added bodies, and the points of these bodies alone; a body is placed after its base."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))

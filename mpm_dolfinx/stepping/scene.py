@@ -212,7 +212,8 @@ class Scene:
         def make() -> OnGrid:
             self._assembled.clear()  # coefficients of its forms change now
             with _compat.Timer("cut domains"):
-                cut = CutDomains(grid, points, self.numerics.quadrature == "domain", self.momentum.inertia is not None)
+                more = self.momentum.inertia is not None, self.storage is not None
+                cut = CutDomains(grid, points, self.numerics.quadrature == "domain", *more)
                 self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
             with _compat.Timer("integration data"):
                 problems = (self.momentum, self.storage)

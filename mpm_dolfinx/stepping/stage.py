@@ -231,7 +231,7 @@ def stage(
     wet = tuple(of for kind in FED for of in kind.conditions)
     for name, one in by_name.items():
         if fluid is None and (isinstance(one, wet) or hasattr(one, "feeding")):
-            raise ValueError(f"{name}: {line(one)}, must be in a scene with a fluid")
+            raise ValueError(f"{name}: {line(one)}, must be in a scene with fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -294,7 +294,7 @@ def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
     if not isinstance(walls, Mapping):
-        raise ValueError(f"walls = {line(walls)}, must be walls with their components, such as {{'left': 'xy'}}")
+        raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
     for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
             raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
