@@ -82,6 +82,7 @@ class GivenDisplacements(Acting):
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
         self._warned: set[int] = set()  # numbers of the conditions, for the log only
+        self._jumped: set[int] = set()  # likewise, for jumps at the start
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
@@ -97,6 +98,29 @@ class GivenDisplacements(Acting):
     def surfaces(self) -> list[Surface]:
         """Faces with prescribed displacements."""
         return [faces for _, faces, _ in self._holds]
+
+    def check_start(self, place: Place) -> None:
+        """Warn, once for each condition, if it moves its side at once as bodies with inertia begin to move.
+
+        The motion in a single step strains the cell at the side more than the stress there.
+        """
+        if not (place.inertia and place.dt):
+            return
+        points = place.points
+        tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
+        for number, (hold, faces, axes) in enumerate(self._holds):
+            p = place.cut.surface(faces)
+            gap = p.origin(points) + self._given(hold, place.start, p.X) - p.now(points)
+            way, h = np.linalg.norm(gap[:, axes], axis=1), self._grid.sizes_at(p.x).min(axis=-1)
+            least = np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at]) * h
+            jump = over_all(self._grid.comm, float(way[way > least].max(initial=0.0)), MPI.MAX)
+            if jump and number not in self._jumped:
+                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: %s"
+                why = (
+                    "its value counts from the start or the last reset_displacement, must begin at the present position"
+                )
+                warn(self._grid.comm, ConditionWarning, what, line(hold), jump, place.start, why)
+                self._jumped.add(number)
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep: one for each component and each cell or point."""
