@@ -40,7 +40,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the stress and the level above positions along vertical lines at places (m, d-1) beside them."""
+    """Return the stress and the level above positions along vertical lines at places (m, d-1) next to them."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -59,7 +59,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
     np.maximum.at(surface, ray, height)
     # positions on the same vertical line share cumulative sums, sorted by line and height
     order = np.lexsort((height, ray))
-    ray, height, weight = ray[order], height[order], weight[order]
+    ray, height, weight = (values[order] for values in (ray, height, weight))
     base, scale = x[:, -1].min(initial=np.inf), 1 + np.ptp(corners[..., -1])
     height = height - base
     ends = np.searchsorted(ray, line, side="right")
