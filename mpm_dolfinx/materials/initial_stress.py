@@ -19,6 +19,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
@@ -376,6 +377,11 @@ def _kappa(m) -> NDArray[np.float64]:
     return m.kappa if isinstance(m, ModifiedCamClay) else np.ones(np.shape(m.bulk))
 
 
+def _friction(m) -> NDArray[np.float64]:
+    """Return the friction angle, degrees, nan for laws without one."""
+    return m.friction if isinstance(m, Frictional) else np.full(np.shape(m.bulk), np.nan)
+
+
 def _prestretch(m) -> NDArray[np.float64]:
     return m.prestretch if isinstance(m, ModifiedCamClay) else np.ones((*np.shape(m.bulk), 3))
 
@@ -394,4 +400,12 @@ def _outside_yield(materials: SceneMaterials, points: MaterialPoints, target: ND
     allowed = f"inside the yield surface of {name}"
     tension = np.trace(target[i]) > 0  # the pore pressure exceeds the overburden
     more = "; K0 needs the weight of open water as surcharge" if tension and points.pressure[i] > 0 else ""
-    return f"initial_stress at {points.x[i] + materials.grid.base}: {target[i].tolist()} Pa, must be {allowed}{more}"
+    friction = materials.table(points, _friction)[i]
+    if np.isfinite(friction):
+        ratio = np.tan(np.radians(45 + friction / 2)) ** 2
+        allowed += (
+            f": without cohesion, friction = {friction:.4g} degrees allows K0 from {1 / ratio:.3g} to {ratio:.3g}"
+        )
+    stress = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(target[i]))
+    where = points.x[i] + materials.grid.base
+    return f"initial_stress at {where}: principal stresses {stress} Pa, must be {allowed}{more}"

@@ -339,10 +339,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
         y[rows] = old - step  # for close points this is the solution
         on = ~(close | failed[rows])
-        rows = rows[on]
-        step = step[on]
-        old = old[on]
-        norm = norm[on]
+        rows, step, old, norm = (values[on] for values in (rows, step, old, norm))
         length = np.ones(int(on.sum()))
         if not len(rows):
             break
@@ -353,9 +350,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
             f[worse], slope[worse], new[worse] = system(rows[worse], old[worse] - length[worse, None] * step[worse])
         failed[rows] = ~(new < norm)
         on = ~failed[rows]
-        rows = rows[on]
-        f = f[on]
-        slope = slope[on]
+        rows, f, slope = (values[on] for values in (rows, f, slope))
         norm = new[on]
     failed[rows] = True  # after so many iterations
     return np.flatnonzero(failed)

@@ -594,19 +594,20 @@ def _polygons(
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
+    near = grid.snap.max()  # within which corners lie on planes
     two = slice(-3, -1)  # two barycentric coordinates, from which areas are computed
     middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
     order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
     v, group = v[:, order], group[order]
     after = _around(group)
-    distinct = np.abs(v[two, after] - v[two]).max(axis=0) > SLIVER
+    distinct = np.abs(v[two, after] - v[two]).max(axis=0) > near
     v, group = v[:, distinct], group[distinct]
     after = _around(group)
     before = np.empty_like(after)
     before[after] = np.arange(len(after))
     a, b = v[two] - v[two, before], v[two, after] - v[two]
     bend = np.abs(a[0] * b[1] - a[1] * b[0])
-    corner = bend > SLIVER * (np.linalg.norm(a, axis=0) + np.linalg.norm(b, axis=0))
+    corner = bend > near * (np.linalg.norm(a, axis=0) + np.linalg.norm(b, axis=0))
     v, group = v[:, corner], group[corner]
     after, sides = _around(group), np.bincount(group, minlength=len(first))
     middle = np.stack([sum_by(group, x, len(first)) for x in v]) / np.maximum(sides, 1)

@@ -223,8 +223,9 @@ def stage(
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
-    if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
-        raise ValueError("conditions: drained or inflow sides without fluid, must be in a scene with fluid")
+    for name, one in by_name.items():
+        if fluid is None and (isinstance(one, wet) or hasattr(one, "feeding")):
+            raise ValueError(f"{name}: {line(one)}, must be in a scene with fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
