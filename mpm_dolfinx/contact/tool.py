@@ -95,9 +95,9 @@ class Tool:
         Direction of the load, of any length.  In axisymmetry: along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
-        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  It is at rest while
-        an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity `outcome("tool_velocity")`
-        (d,), m/s.
+        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  It keeps its
+        position while an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity
+        `outcome("tool_velocity")` (d,), m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment

@@ -253,17 +253,13 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved.
-
-    points: n points; target (n, 3, 3): stress, Pa.
-    given (n,): whether the stress is a parameter; plastic (n,): whether C_p^-1 is a state variable.
-    """
+    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved."""
 
     materials: SceneMaterials
-    points: MaterialPoints
-    target: NDArray[np.float64]
-    given: NDArray[np.bool_]
-    plastic: NDArray[np.bool_]
+    points: MaterialPoints  # n points
+    target: NDArray[np.float64]  # (n, 3, 3) stress, Pa
+    given: NDArray[np.bool_]  # (n,) whether the stress is a parameter
+    plastic: NDArray[np.bool_]  # (n,) whether C_p^-1 is a state variable
 
     @property
     def components(self) -> tuple[tuple[int, int], ...]:

@@ -161,7 +161,8 @@ def begin_stage(
         points = replace(points, origin=points.corners)
     outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(after, before) else None
-    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest, "trend": None}
+    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    new["trend"] = None if add or remove else state.trend
     return replace(state, points=points, pieces=pieces, **new)
 
 
@@ -438,7 +439,8 @@ def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArr
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
-    place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
+    at = start.on_grid.cut, start.on_grid.fill, state.points, data
+    place = Place(*at, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
     when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
     return scene.balance(when, matrices.momentum, data, loads, 0.0)

@@ -46,16 +46,13 @@ from mpm_dolfinx.stepping.state import State
 
 
 class When(NamedTuple):
-    """A substep: time at its end, s; time since the start of the step, s; gravity (d,), m/s^2, or None.
+    """A substep."""
 
-    own: weight of the rate at its end, s; past: fraction of the displacement at its start, see `Velocity`.
-    """
-
-    t: float
-    since: float
-    gravity: NDArray[np.float64] | None
-    own: float
-    past: float
+    t: float  # time at its end, s
+    since: float  # time since the start of the step, s
+    gravity: NDArray[np.float64] | None  # (d,), m/s^2
+    own: float  # weight of the rate at its end, s
+    past: float  # fraction of the displacement at its start, see `Velocity`
 
 
 class Scene:

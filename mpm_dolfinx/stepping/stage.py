@@ -82,25 +82,19 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The conditions of a stage.
+    """The conditions of a stage."""
 
-    given: conditions by name, as given; named: the same, with the unit weight of water of the pore fluid.
-    conditions: walls, with the axis, and gravity; present: whether each body is present; later: bodies to be added.
-    free (nodes, d): whether walls leave each component free; axisymmetric: see `Grid`; materials: the scene's.
-    lattices: of present bodies; acting: loads in the balance of momentum; feeding: terms in the balance of fluid.
-    """
-
-    given: Mapping[str, Condition]
-    named: Mapping[str, Condition]
-    conditions: Mapping[str, Any]
-    present: tuple[bool, ...]
-    later: tuple[int, ...]
-    free: NDArray[np.bool_]
-    axisymmetric: bool
-    lattices: Sequence[Lattice]
-    materials: SceneMaterials
-    acting: tuple[Acting, ...]
-    feeding: tuple[Feeding, ...]
+    given: Mapping[str, Condition]  # conditions by name, as given
+    named: Mapping[str, Condition]  # the same, with the unit weight of water of the pore fluid
+    conditions: Mapping[str, Any]  # walls, with the axis, and gravity
+    present: tuple[bool, ...]  # whether each body is present
+    later: tuple[int, ...]  # indices of bodies to be added
+    free: NDArray[np.bool_]  # (nodes, d) whether walls leave each component free
+    axisymmetric: bool  # see `Grid`
+    lattices: Sequence[Lattice]  # of present bodies
+    materials: SceneMaterials  # of the scene
+    acting: tuple[Acting, ...]  # loads in the balance of momentum
+    feeding: tuple[Feeding, ...]  # terms in the balance of fluid
 
     @property
     def inertia(self) -> bool:
