@@ -17,16 +17,13 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import Displacement, Quiet
 from mpm_dolfinx.conditions.sides import check_apart, gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.velocity import Velocity
-from mpm_dolfinx.grid.grid import SIDES, Grid
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.grid.grid import Grid
 
 
 def traction_name(name: str) -> str:
@@ -68,9 +65,9 @@ class QuietSides(Acting):
         self._sides = {name: (side, setting.sides.of(side)) for name, side in sides.items()}
         for (one, faces), (other, others) in combinations(self._sides.values(), 2):
             check_apart(one, faces, other, others)
-        for side, faces in self._sides.values():
+        for side in sides.values():
             side.at(0.0, self._grid.dim)
-            _check_free(setting, side, faces)
+            setting.sides.check_moves(side, setting.of(Displacement).values(), setting.free)
 
     def named(self, names: Collection[str]) -> dict[str, Surface]:
         """Return the faces of the named sides."""
@@ -126,20 +123,3 @@ class QuietLoads(Loads):
     def tangent(self, K: PETSc.Mat) -> None:
         """Add the derivative of the viscous resistance."""
         self._forms.slope.assemble_matrix(K, self._data)
-
-
-def _check_free(setting: Setting, side: Quiet, faces: Surface) -> None:
-    """Raise ValueError for a quiet side without effect: a displacement or a wall fixes all components of its faces."""
-    grid = setting.grid
-    d = grid.dim
-    for hold in setting.of(Displacement).values():
-        if len(hold.axes(d)) == d:
-            check_apart(side, faces, hold, setting.sides.of(hold))
-    x = faces.places()
-    for wall, (axis, end) in SIDES[d].items():
-        moves = over_all(grid.comm, int(setting.free[grid.wall_nodes(wall)].sum())) > 0
-        off = np.abs(x[:, :, axis] - (grid.lower, grid.upper)[end][axis]).max(axis=1)
-        on = np.flatnonzero(off <= NEAR * grid.finest[axis])
-        if len(on) and not moves:
-            what = f"{line(side)}: the wall {wall!r} of the grid fixes the side at {x[on[0]].mean(axis=0)}"
-            raise ValueError(f"{what}, must leave it free in this stage")

@@ -13,11 +13,7 @@ from mpm_dolfinx.base.validation import flag, instance, line
 from mpm_dolfinx.io.units import unit
 from mpm_dolfinx.io.writer import VTK_CELLS, fields_of_points
 from mpm_dolfinx.parallel.exchange import to_root
-from mpm_dolfinx.points.material_points import ACROSS
 from mpm_dolfinx.simulation.simulation import Simulation
-
-INTERNAL = (ACROSS, "owed", "due", "softness")
-"""Fields that only the method needs; messages do not offer them."""
 
 
 def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
@@ -98,7 +94,7 @@ def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
         known |= {name.removeprefix("effective_"): known[name] for name in known if name.startswith("effective_")}
     if field not in known:
         names = ", ".join(
-            name for name in {**known, **(fields or fields_of_points(simulation))} if name not in INTERNAL
+            name for name in {**known, **(fields or fields_of_points(simulation))} if name not in points.INTERNAL
         )
         raise ValueError(f"plot: field = {line(field)}, must be one of {names}")
     return np.asarray(known[field](), dtype=np.float64)

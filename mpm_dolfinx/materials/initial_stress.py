@@ -19,12 +19,11 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints
 
 EXACT, CLOSE = 1e-13, SAME  # errors of the stress / largest initial stress: at which Newton's method ends, and allowed
 MOST = 30  # Newton iterations
@@ -347,7 +346,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
     F = moved.F_of_laws
     d = F.shape[1]
     law = materials.law_of(points)
-    own = {name: points.data[name] for name in ("softness", "owed", "due", ACROSS) if name in points.data}
+    own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
     whole = np.tile(np.eye(3), (len(F), 1, 1))
@@ -379,7 +378,7 @@ def _kappa(m) -> NDArray[np.float64]:
 
 def _friction(m) -> NDArray[np.float64]:
     """Return the friction angle, degrees, nan for laws without one."""
-    return m.friction if isinstance(m, Frictional) else np.full(np.shape(m.bulk), np.nan)
+    return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
 
 
 def _prestretch(m) -> NDArray[np.float64]:

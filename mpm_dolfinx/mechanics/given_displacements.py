@@ -110,15 +110,13 @@ class GivenDisplacements(Acting):
         tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
         for number, (hold, faces, axes) in enumerate(self._holds):
             p = place.cut.surface(faces)
-            gap = p.origin(points) + self._given(hold, place.start, p.X) - p.now(points)
-            way, h = np.linalg.norm(gap[:, axes], axis=1), self._grid.sizes_at(p.x).min(axis=-1)
-            least = np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at]) * h
-            jump = over_all(self._grid.comm, float(way[way > least].max(initial=0.0)), MPI.MAX)
+            gap = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
+            strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
+            sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+            jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
             if jump and number not in self._jumped:
-                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: %s"
-                why = (
-                    "its value counts from the start or the last reset_displacement, must begin at the present position"
-                )
+                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: it %s"
+                why = "counts from the start or the last reset_displacement, must begin at the present position"
                 warn(self._grid.comm, ConditionWarning, what, line(hold), jump, place.start, why)
                 self._jumped.add(number)
 

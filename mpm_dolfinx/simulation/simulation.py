@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.errors import Report, StepFailed, raise_interrupt
 from mpm_dolfinx.base.validation import instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
-from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.names import ByName
@@ -223,7 +222,7 @@ class Simulation:
         KeyError
             The quantity is unknown; the message lists the known quantities.
         """
-        known = dict.fromkeys([*QUANTITIES, *OF_RAIN, *MOTIONS, *self.state.outcome])
+        known = dict.fromkeys([*self.state.stage.quantities, *self.state.outcome])
         if quantity not in known:
             raise KeyError(f"outcome: quantity = {line(quantity)}, must be one of {', '.join(known)}")
         return ByName(self.state.outcome.get(quantity, {}))

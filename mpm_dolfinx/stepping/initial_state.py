@@ -47,7 +47,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
-from mpm_dolfinx.stepping.moving_lines import followed_tool
 from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State, Stay
@@ -76,8 +75,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
             f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
         )
     _check_weight(first, None, 0.0)
-    if hasattr(scene.grid.follow, "pose") and followed_tool(scene.grid, first.given) is None:
-        raise ValueError(f"grid: follow = {line(scene.grid.follow)}: not in the first stage, must be in its conditions")
+    scene.check_followed(first)
     comm, gravity = scene.grid.comm, first.conditions["gravity"]
     warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
     if scene.fluid and scene.materials.conducts:

@@ -14,7 +14,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.validation import all_of, check_names, given, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
+from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES, Acting, Loads, Outcome, Place, Setting
 from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
@@ -147,6 +147,11 @@ class Stage:
         """Return the names of conditions that are unchanged from the previous stage, or have their own name."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Quantities that conditions of the package may return."""
+        return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return results of conditions, by quantity and name, all equal to `value`, before the first step."""
