@@ -133,9 +133,8 @@ class CutDomains(Keyed):
         `part` (n,) is the number of the part to which each point belongs.
         """
         far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
-        largest = np.full(count, far.max(initial=0.0))
+        largest = np.zeros(count) if count > 1 else far.max(initial=0.0, keepdims=True)
         if count > 1:
-            largest[:] = 0.0
             np.maximum.at(largest, part, far)
         return over_all(self.grid.comm, largest, MPI.MAX)
 
@@ -156,10 +155,7 @@ class CutDomains(Keyed):
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
-
-        `volume` (m,) are the volumes of the pieces, m^d.
-        """
+        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of plane sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]

@@ -224,10 +224,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return sums (nodes,) at the active local nodes, over all processes, of values (cells,) of owned cells.
-
-        The values may differ between the nodes of a cell (cells, 2^d).
-        """
+        """Return sums (nodes,) of values (cells,), or (cells, 2^d) at their nodes, of owned cells of all processes."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
         nodes = self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
