@@ -237,7 +237,8 @@ class ContactLaw:
         `x` (m, d), m, are the positions of the points.  Raise NotConverged after ROUNDS augmentations.
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
-        plane = self.total(self.pairs.area / self.grid.around(x))
+        around = np.broadcast_to(self.grid.around(x), self.pairs.area.shape)  # 0 on the axis, like the area there
+        plane = self.total(np.divide(self.pairs.area, around, out=np.zeros_like(around), where=around > 0))
         whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.key % self.grid.num_local)))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
         most = over_all(self.grid.comm, float(off.max(initial=0.0)), MPI.MAX)
