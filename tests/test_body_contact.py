@@ -285,7 +285,7 @@ def test_what_are_no_contacts_is_refused():
     s = mpm.Simulation(
         grid, boxes[:2], [sand], walls={"bottom": "xy"}, conditions=[mpm.Contact(0, 1)], gravity=[0, -10]
     )
-    with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
+    with pytest.raises(ValueError, match=r"factor_of_safety: the scene has contacts, must have none"):
         mpm.factor_of_safety(s)
 
 

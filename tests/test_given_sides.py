@@ -132,7 +132,14 @@ def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_l
     )
     assert loads == pytest.approx(loads.mean(), rel=0.06)
     assert loads[..., 1] == pytest.approx(loads[..., 0], rel=0.025)
-    assert loads[..., 2] == pytest.approx(loads[..., 1], rel=0.04)  # the largest where it rests on a grid line
+    assert loads[..., 2] == pytest.approx(loads[..., 1], rel=0.01)
+
+
+def test_a_side_that_has_come_to_a_grid_line_rests_there():
+    """By 0.02 of a cell it was in nearly empty cells, and its force grew by 8 % while it was held."""
+    loads = np.array(pushed_along_a_rough_base(0.8, 5, 0.52))
+    print(f"at once, held for one step, for ten {loads}")
+    assert loads == pytest.approx(loads[0], rel=0.01)
 
 
 def test_a_side_one_cell_high_on_a_rough_base_is_held_too():
@@ -153,7 +160,7 @@ def on_top(*regions, h=0.1, walls=WALLS, side="top"):
 
 
 def test_displacements_that_differ_where_they_meet_are_refused():
-    with pytest.raises(ValueError, match=r"differ by 0.002 m at t = 1 s where they meet, at \[1. 1.\]; must agree"):
+    with pytest.raises(ValueError, match=r"differ by 0.002 m at t = 1 s where they meet, at \[1. 1.\]; must be equal"):
         on_top((0, 1, (0, 0)), (1, 2, (0, -0.002))).run(1, 1)
     whole, halves = on_top((0, 2, (0, -0.002))), on_top((0, 1, (0, -0.002)), (1, 2, (0, -0.002)))
     whole.run(1, 1), halves.run(1, 1)
@@ -163,7 +170,7 @@ def test_displacements_that_differ_where_they_meet_are_refused():
 
 
 def test_a_motion_that_a_wall_forbids_is_refused():
-    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a wall .* fixes it"):
+    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, which a wall .* fixes there"):
         on_top((0, 2, (0, 0.01)), side="bottom").run(1, 1)
     assert on_top((0, 2, (0, 0)), side="bottom").run(1, 1).converged
 

@@ -228,7 +228,7 @@ class CompiledForm:
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix to `A`, with unrolled dofs and without final assembly.  `rows` as for the vector."""
+        """Add the matrix to `A`, with unrolled dofs, without final assembly.  `rows` replace dolfinx's coefficients."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)

@@ -26,7 +26,7 @@ class Latest(Generic[T]):
         self._entry: tuple[Any, T] | None = None
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
-        """Return the value for a key.  It is computed again if the key differs from the last one.
+        """Return the value for a key; compute the value again if the key differs from the last key.
 
         Parameters
         ----------

@@ -7,8 +7,8 @@ porosity is n = 1 - (1 - n0) / J.  Therefore S J = a J + b is linear in J, with 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
-computed as the change of this mass, divided by rho at the mean pressure of the step.  It is second-order accurate
-for any path, and zero without flow for any step size.
+computed as the change of this mass, divided by rho at the mean pressure of the step.  This change is
+second-order accurate for any path, and zero without flow for any step size.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi with
 pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  The density between two pressures is the logarithmic mean

@@ -23,17 +23,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from inspect import Parameter, signature
 from math import inf
 from pathlib import Path
 from types import FunctionType, MethodType
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 LONGEST = 160  # most characters of a value in a message
+_known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
+"""Parameters of functions that have been called."""
 
 
 def line(value) -> str:
@@ -136,7 +139,7 @@ def functions(name: str, values) -> None:
 
 
 def asked(name: str, allowed: str, function: Callable, *values):
-    """Return the value of a user's function.  Its exceptions become a ValueError that names the object."""
+    """Return the value of a user's function.  Exceptions become a ValueError that names the object."""
     try:
         return function(*values)
     except Exception as error:
@@ -179,6 +182,8 @@ def _plain(function: Callable) -> bool:
 
 def _parameters(function: Callable) -> list[Parameter] | None:
     """Return the parameters to which arguments are passed; None if they are unknown."""
+    with suppress(KeyError, TypeError):  # some objects have no hash
+        return _known[function]
     try:
         every = list(signature(function).parameters.values())
     except (TypeError, ValueError):  # some built-in functions
@@ -186,7 +191,10 @@ def _parameters(function: Callable) -> list[Parameter] | None:
     named = [p for p in every if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     if not named and any(p.kind == p.VAR_POSITIONAL for p in every):
         return None
-    return [p for p in named if p.default is p.empty] or named
+    out = [p for p in named if p.default is p.empty] or named
+    with suppress(TypeError):
+        _known[function] = out
+    return out
 
 
 def takes(function: Callable) -> tuple[str, ...] | None:

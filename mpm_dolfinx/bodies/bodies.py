@@ -232,10 +232,7 @@ def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.
 def material_points(
     grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
 ) -> MaterialPoints:
-    """Return the material points of the bodies on this process, with zero velocity and a pore pressure.
-
-    See `pressure_at` for the pressure.
-    """
+    """Return the material points of the bodies on this process, with the pore pressures of `pressure_at`."""
     starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
     rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
     ids = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])

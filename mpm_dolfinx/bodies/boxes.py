@@ -170,7 +170,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     grid
         Background grid.
     lower, upper : (d,), m
-        Corners of the box, inside the grid.  They need not lie on grid lines.
+        Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
         lines.  With 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.

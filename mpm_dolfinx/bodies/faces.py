@@ -37,8 +37,8 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 class Surface:
     """Faces of particle domains on one side of the bodies, the same on every process; arrays over m rows.
 
-    The free part of a face is the part that touches no other body.  It has a row for each polygon of up to four
-    corners into which it is divided.
+    The free part of a face is the part that touches no other body.  It is divided into polygons of up to four corners;
+    each polygon has a row.
     """
 
     id: NDArray[np.int64]  # number of the material point (m,), ascending
@@ -126,7 +126,7 @@ def surface(
 ) -> Surface:
     """Return the faces on a side of the active bodies, without the parts that touch other bodies.
 
-    Contact is determined for the seeded bodies, after their maps.  It is permanent, because bodies in contact stick.
+    Contact is determined for the seeded bodies, after their maps.  Contact is permanent, because touching bodies stick.
 
     Parameters
     ----------

@@ -47,10 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill's faces lie on the paired face, and that face's displacement there.
-
-        The displacements have the shape (n, 4, d) and the unit m.
-        """
+        """Return which corners (n, 4) of the fill lie on the paired face, and its displacements there (n, 4, d), m."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
@@ -224,9 +221,9 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the depth, m, by which a body penetrates the fill's domains, else the gap in cells; and the place.
+    """Return the penetration depth of a body into the fill's domains, m, the gap in cells, and the position (d,), m.
 
-    The result is (depth, gap, position); depth or gap is 0.
+    Depth or gap is zero.
     """
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))

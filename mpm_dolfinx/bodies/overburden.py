@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Overburden: weight of the domains vertically above positions in the bodies.
 
-Vertical lines enter and leave domains through their faces; in 3D these are triangles about the face's middle, like the
-cut of domains.  Domains that share a face therefore leave no gap, and do not overlap.
+Vertical lines enter and leave domains through faces.  In 3D each face consists of triangles about its middle, as where
+the grid cuts domains.  Domains that share a face therefore leave no gap, and do not overlap.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
 
-    Both are means over lines on all sides of a position, because a border of domains may lie above it.
+    Both are means over lines on all sides of a position, because a border of domains may lie above the position.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the stress and the level above positions along vertical lines at places (m, d-1) next to them."""
+    """Return overburden stress, Pa, and surface level, m, above positions x along vertical lines at (m, d-1)."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -70,9 +70,9 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield the lines (k,) of m that cross each part of the faces of their domains (m, 2^d, d), heights, and signs.
+    """Yield indices (k,) of vertical lines that cross a face of their domain (m, 2^d, d), heights and signs (k,).
 
-    at (m, d-1): places of the lines; signs (k,): 1 where a line leaves its domain upwards, -1 where it enters.
+    `at` (m, d-1) are the positions of the lines.  A sign is 1 where the line leaves the domain upwards, else -1.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

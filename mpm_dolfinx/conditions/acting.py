@@ -37,6 +37,8 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """Reactions, outflows and other results of the conditions: quantity, such as "reactions" -> condition -> values."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Quantities that the conditions of the package return."""
+OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
+"""Further quantities of scenes with rain."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 """Further quantities of free tools."""
 
@@ -95,6 +97,7 @@ class Place(NamedTuple):
     """Positions and times at which conditions act in a substep."""
 
     cut: CutDomains  # particle domains cut by the grid
+    fill: NDArray[np.float64]  # volume fraction of the local cells
     points: MaterialPoints  # material points at the start of the step
     pieces: Any  # quadrature points, see `QuadratureData`
     start: float  # start of the step, s
@@ -218,7 +221,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local degrees of freedom (n,) on walls, unrolled, and forces (n,), N, there that no wall exerts."""
+        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on them that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def touching(self) -> tuple | None:
@@ -233,10 +236,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors (cells,), N, of forces in local cells, including this condition.
-
-        `of_cells` are the errors without it.
-        """
+        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` leave out this condition."""
         return of_cells
 
     @property

@@ -44,6 +44,10 @@ class Condition:
     """Attributes that may be functions, and the allowed parameters of each."""
 
     def __post_init__(self):
+        for name in ("side", "other"):
+            if not isinstance(getattr(self, name, ""), str):
+                what = f"{type(self).__name__}: {name} = {line(getattr(self, name))}"
+                raise ValueError(f"{what}, must be the name of one side; give one condition for each side")
         for name, value in vars(self).items():
             if isinstance(value, (list, tuple, np.ndarray)):
                 object.__setattr__(self, name, deepcopy(value))
@@ -91,10 +95,10 @@ class Traction(Condition):
 class Pressure(Condition):
     """Pressure on a side of the bodies that follows the surface: normal to the surface, per current area.
 
-    It adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the pores,
-    `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is closed, or
-    ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the stability of
-    dry equilibria is not checked.
+    The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
+    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is
+    closed, or ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the
+    stability of dry equilibria is not checked.
 
     Parameters
     ----------
@@ -124,9 +128,10 @@ class Pressure(Condition):
 class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
-    The traction resists the velocity.  It is the velocity times the impedance of the material, rho c_p along the normal
-    and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few per cent
-    are reflected.  A side that was fixed in a stage without inertia keeps its tractions.
+    The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
+    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few
+    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies
+    with weight need such a stage.
 
     Parameters
     ----------
@@ -141,7 +146,8 @@ class Quiet(Condition):
     ------
     ValueError
         From the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the side;
-        another `Quiet` on the same part of a face.
+        another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid that
+        fixes it; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
     side: str
@@ -369,7 +375,8 @@ class Tied(Condition):
     Raises
     ------
     ValueError
-        From the scene: the sides are not opposite, or their faces differ.
+        From the scene: the sides are not opposite, or their faces differ; another `Tied`, a `Quiet`, `Drained`,
+        `Inflow` or `Rain` on the same part of a face.
     """
 
     side: str

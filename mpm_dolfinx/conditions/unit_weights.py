@@ -71,14 +71,14 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 
 
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
-    """Warn of each water level whose unit weight differs from the pore fluid's.
+    """Warn about each water level whose unit weight differs from that of the pore fluid.
 
-    In a dry scene warn of each level with the unit weight of water under another gravity.
+    In a dry scene, warn about each level whose unit weight is not that of water under the scene's gravity.
 
     Parameters
     ----------
     levels
-        Names and pressures of the levels.
+        Name and water pressure of each level.
     """
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
     if fluid is None:
@@ -90,7 +90,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(comm, ConditionWarning, f"{what}: at one level they are not at rest", name, weight, of, own)
+            warn(comm, ConditionWarning, f"{what}: at one level they are not in equilibrium", name, weight, of, own)
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:

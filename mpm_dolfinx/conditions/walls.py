@@ -31,17 +31,13 @@ def wall_forces(
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)
-    place, letter = grid.nodes_along(grid.node_x[node]), np.array(list("xyz"))[component]
+    place, fixed = grid.nodes_along(grid.node_x[node]), [[a in walls.get(name, "") for a in "xyz"] for name in sides]
     across = np.array([component == axis for axis, _ in sides.values()])
-    holds = np.array(
-        [
-            (place[:, axis] == end * grid.shape[axis]) & np.isin(letter, list(walls.get(name, "")))
-            for name, (axis, end) in sides.items()
-        ]
-    )
+    holds = np.array([place[:, axis] == end * grid.shape[axis] for axis, end in sides.values()])
+    holds &= np.array(fixed)[:, component]
     holds = np.where((holds & across).any(axis=0), holds & across, holds)
     shares = holds / np.maximum(1, holds.sum(axis=0)) * forces
-    out = grid.comm.allreduce(np.stack([sum_by(component, share, d) for share in shares]))
+    out = grid.comm.allreduce(sum_by(component, shares, d))
     if grid.has_axis:
         out[0, 0] = 0.0
     return dict(zip(sides, out, strict=True))

@@ -29,7 +29,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 from mpm_dolfinx.conditions.acting import At, Shares
 from mpm_dolfinx.contact.problem import ContactProblem, Found, SubstepMotion, outer
 from mpm_dolfinx.mechanics.inertia import Flight
@@ -138,6 +138,14 @@ class FreeTools(ContactProblem):
         moment = (across(found.at.arm) * force).sum(axis=1, keepdims=True)[:, : self.grid.dim == 2]
         return np.hstack([force, moment])
 
+    def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return bounds (m, q) of the generalised forces on the tools, from the sizes (m, d) of contact forces, N.
+
+        A moment is compared with lever arm times force: the moment of a smooth disc consists of rounding errors alone.
+        """
+        moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
+        return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
+
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the motions (k, q) of the tools at w (m, d), m, from the last linearisation."""
         last = self.now.linear
@@ -163,21 +171,27 @@ class FreeTools(ContactProblem):
         d = self.grid.dim
         motions = self._guides.transpose(2, 0, 1)
         columns = [self._onto(found, self._pulled(found, q)) for q in motions]
-        onto = self._onto(found, found.touch.force)
-        rows = np.stack([onto, np.abs(onto), *columns], axis=2)  # empty on processes without contact
+        force = found.touch.force
+        onto = self._onto(found, force)
+        unknown = (law.rounding(self.now.state) * (found.touch.stiff > 0))[:, None]
+        size, least = self._sizes(found, np.abs(force)), self._sizes(found, np.broadcast_to(unknown, force.shape))
+        rows = np.stack([onto, size, least, *columns], axis=2)  # empty on processes without contact
         sums = law.by_contact(rows.reshape(len(onto), int(np.prod(rows.shape[1:]))))
-        sums = sums.reshape(len(motions[0]), len(motions), 2 + len(columns))
-        S = sums[:, :, 2:]
+        sums = sums.reshape(len(motions[0]), len(motions), 3 + len(columns))
+        S = sums[:, :, 3:]
         if d == 2:  # the lever arm changes as the tool moves
             S[:, d, :d] += np.einsum("kij,ki->kj", self._guides[:, :d, :d], across(sums[:, :d, 0]))
-        inertial = self._rate * self._mass * (found.motion - self._free)
-        S = self._guides @ S + (self._rate * self._mass)[:, None] * np.eye(len(motions))
+        inertia = self._rate * self._mass
+        inertial = inertia * (found.motion - self._free)
+        S = self._guides @ S + inertia[:, None] * np.eye(len(motions))
         free = self._free_tools
         inverse = np.zeros_like(S)
         inverse[free] = self._guides[free] @ np.linalg.inv(S[free])
         off = self._pushes - inertial - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
         scale = np.maximum(np.abs([self._pushes, inertial]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
         scale[:, :d] = np.linalg.norm(scale[:, :d], axis=1, keepdims=True)
+        rounding = sums[:, :, 2] + ROUND_OFF * inertia * (np.abs(found.motion) + np.abs(self._free))
+        scale = np.maximum(scale, rounding / SAME)
         share = (np.abs(off) / np.where(scale > 0, scale, 1.0)).max(axis=1)
         return MotionEquation(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 

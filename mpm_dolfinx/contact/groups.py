@@ -85,9 +85,9 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
         if common := set(one) & set(other):
             what = f"contacts: body {min(common)} is in the groups {line(one)} and {line(other)}"
             raise ValueError(f"{what}, must be in one; name all bodies of a group in each of its contacts")
-        count = sum({*pair} == {one, other} for pair in pairs)
-        if count != 1:
-            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {count}, must have one contact")
+        between = sum({*pair} == {one, other} for pair in pairs)
+        if between != 1:
+            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {between}, must have one contact")
     if missing := set(range(count)) - {body for group in groups for body in group}:
         raise ValueError(f"contacts: body {min(missing)} is in no group, must be in one")
     return groups

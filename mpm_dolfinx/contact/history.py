@@ -45,10 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with the mean contact pressures and tractions of their pairs.
-
-        `push` (m,) and `shear` (m, d), Pa, are the pressures and shear tractions of the pairs.
-        """
+        """Return the points with means of pressures `push` (m,) and tractions `shear` (m, d), Pa, of their pairs."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)

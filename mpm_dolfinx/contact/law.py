@@ -6,9 +6,9 @@ At a position with gap g, the contact pressure and its energy per area are
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
 The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier lambda has one value for each
-contact and cell.  It starts from the pressure of the previous step.  Augmentation (Uzawa's method) updates lambda until
-the mean penetration in each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step, and on
-the shear traction t_n of the points after the previous step,
+contact and cell, which starts from the pressure of the previous step.  Augmentation (Uzawa's method) updates lambda
+until the mean penetration in each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step,
+and on the shear traction t_n of the points after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
@@ -43,7 +43,7 @@ from mpm_dolfinx.parallel.exchange import first, over_all
 STIFF = 100.0
 """Stiffness k in units of (resistance) / (cell size)."""
 GRIP = 6.0
-"""Stiffness k_t in units of (resistance) / (cell size).  If larger, shears may alternate without nodal forces."""
+"""Stiffness k_t in units of (resistance) / (cell size).  A larger k_t allows shears that cancel at the nodes."""
 DEPTH = 5e-4  # cells: allowed mean penetration
 SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations

@@ -56,7 +56,8 @@ class Pushes:
 class LinearMotion:
     """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-    They are motion + shift + sum slope . (w' - w), with the sum over the pairs of a tool.  Newton's method uses them.
+    The displacements are motion + shift + sum slope . (w' - w); the sum is over the pairs of a tool.  Newton's method
+    uses this line.
     """
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
@@ -171,6 +172,11 @@ class ContactProblem(Loads):
         """Whether the contact couples nodes of different cells."""
         return self.pushed or self._cell_pairs is not None
 
+    @property
+    def _still(self) -> NDArray[np.float64]:
+        """Zero displacements of tools by loads: (k,), or with free tools (k, q)."""
+        return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
+
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
         key = self.now, at.unknowns, at.u[at.unknowns.owned]
@@ -192,7 +198,7 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._motion(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
+        return self._find_at(w, self._motion(w) if self.pushed else self._still)
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         law = self.now.law

@@ -201,10 +201,10 @@ class Tools(Touching):
         return out
 
     def placed(self, place: Place) -> Loads:
-        """Return the loads by contact with tools in a substep."""
+        """Return the loads by contact with tools in a substep; without inertia free tools keep their position."""
         before = self._before(place)
         tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
-        if not self.free:
+        if not (self.free and place.inertia):  # an initial stress is balanced without inertia
             return ToolLoads(tools, place)
         velocity = self._of_free(place.before, "tool_velocity", "tool_spin")
         options = {"velocity": velocity, "pushes": self.pushes(place.t)}
@@ -300,10 +300,7 @@ class Tools(Touching):
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
     def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if a tool contains points, touches prescribed sides, or has passed through a body in a step.
-
-        `before` are the points at the start of the step.
-        """
+        """Raise an error if a tool contains points, touches prescribed sides, or passed through a body in a step."""
         t = place.t
         for tool in self.tools:
             for hold, faces in self._held:

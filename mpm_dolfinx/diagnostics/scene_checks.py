@@ -71,7 +71,7 @@ def check_held(
         ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         reached[1:] = missing == 0
-        if (missing == before).all():
+        if reached.all() or (missing == before).all():
             break
     for k in range(1, count + 1):
         if missing[k - 1]:
@@ -91,6 +91,7 @@ def _extents(active: ActiveSet, part: NDArray[np.int64], count: int) -> tuple[ND
     grid = active.grid
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):
-        np.minimum.at(ends, part, sign * grid.midpoints[active.cells])
+        for k in range(count):
+            ends[k] = (sign * grid.midpoints[active.cells[part == k]]).min(axis=0, initial=np.inf)
         grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
     return (low - high) / 2, (-high - low + (grid.h if grid.even else grid.most)).max(axis=1)

@@ -104,16 +104,16 @@ class CutDomains(Keyed):
         Material points of this process; they must be inside the grid.
     domains
         Whether to integrate over the exact pieces of the domains.  If not, each point is one piece, as in standard MPM.
-    second
-        Whether to compute second moments of the pieces.
+    second, faces
+        Whether to compute second moments and face areas of the pieces.
     """
 
-    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False):
+    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False, faces: bool = True):
         self.grid = grid
         self.points = points
         self.domains = domains
         self._patches: dict[Surface, Patches] = {}
-        self.pieces = cut(grid, points.corners, second) if domains else whole_points(grid, points.x)
+        self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
         self._exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
@@ -131,8 +131,11 @@ class CutDomains(Keyed):
 
         `part` (n,) is the number of the part to which each point belongs.
         """
-        largest = np.zeros(count)
-        np.maximum.at(largest, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
+        far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
+        largest = np.full(count, far.max(initial=0.0))
+        if count > 1:
+            largest[:] = 0.0
+            np.maximum.at(largest, part, far)
         return over_all(self.grid.comm, largest, MPI.MAX)
 
     def valid(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
@@ -152,10 +155,7 @@ class CutDomains(Keyed):
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
-
-        `volume` (m,) are the volumes of the pieces, m^d.
-        """
+        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of plane sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]

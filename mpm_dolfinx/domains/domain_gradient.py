@@ -28,8 +28,8 @@ def gradient(
         Current corners, and reference corners.
     """
     if corners.shape[2] == 2:
-        dx, dX = (y[:, [3, 2]] - y[:, [0, 1]] for y in (corners, reference))
-        F = np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        dx, dX = (y[:, :1:-1] - y[:, :2] for y in (corners, reference))  # the diagonals
+        F = dx.swapaxes(1, 2) @ cofactor(dX) / determinant(dX)[:, None, None]
         if not axisymmetric:
             return F
         out = np.zeros((len(F), 3, 3))
@@ -69,9 +69,9 @@ def cell_ratios(
 
     With mean dilatation, the ratio of a cell is the current volume of its domains, from their corners, divided by the
     reference volume.  This ratio depends on no path, and its variation within the cell does no work.  Ratios that are
-    updated only by increments would drift from the domain volumes, since no force would oppose the drift.  Other pieces
-    have the ratio of their point.  The same applies in cells with yielded soil, because corner volumes are meaningless
-    near plastic flow.
+    updated only by increments would drift from the domain volumes, since no force would oppose the drift.  Without
+    mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
+    volumes are meaningless near plastic flow.
 
     Parameters
     ----------

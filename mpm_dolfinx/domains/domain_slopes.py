@@ -85,7 +85,7 @@ class Neighbours:
 
         def of(face: int) -> tuple[NDArray, NDArray, NDArray]:
             at = self._partner[face]
-            return own[:, point[at]], centres[:, at], at >= 0
+            return own.take(point[at], axis=1), centres.take(at, axis=1), at >= 0
 
         return of
 
@@ -144,20 +144,18 @@ def linear_gradients(
     d, k = cut.grid.dim, F.shape[1]
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
     slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, soils)
-    offset = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
-    xi = [sum(inverse[a, b][of] * x for b, x in enumerate(offset)) for a in range(d)]
-    J, cofactors = determinant(F), cofactor(F).transpose(1, 2, 0).swapaxes(0, 1)
+    offset = [x - sum_by(of, fraction * x, len(F)).take(of) for x in cut.pieces.x.T]
+    xi = [sum(inverse[a, b].take(of) * x for b, x in enumerate(offset)) for a in range(d)]
+    J, base = determinant(F), F.transpose(1, 2, 0).copy()
+    cofactors = cofactor(F).transpose(2, 1, 0).copy()
     e = np.einsum("ijn,ajkn->aikn", cofactors / J, slope)
     ratio = np.trace(e, axis1=1, axis2=2)
     # the mean is weighted by reference volumes; the second-order part would change the domain's volume and is removed
-    shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
-    for a, b in np.ndindex(d, d):
-        variance = sum_by(of, fraction * xi[a] * xi[b], len(F))
-        shift += variance * ratio[b] * slope[a]
-        second += 0.5 * variance * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
-    base = F.transpose(1, 2, 0)
-    base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
-    out = base[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
+    variances = sum_by(of, np.array([[fraction * x * y for y in xi] for x in xi]), len(F))
+    weight, part = np.einsum("abn,bn->an", variances, ratio), np.einsum("abn,bjkn->ajkn", variances, e)
+    second = 0.5 * (np.einsum("an,aikn->ikn", weight, e) - np.einsum("aijn,ajkn->ikn", e, part))
+    base = base - np.einsum("ijn,jkn->ikn", base, second) + np.einsum("an,aijn->ijn", weight, slope)
+    out = base.take(of, axis=2) + sum(x * slope[a].take(of, axis=2) for a, x in enumerate(xi))
     out = np.ascontiguousarray(out.transpose(2, 0, 1))
     ratios = determinant(out)
     if (inverted := ratios <= 0).any():  # such domains keep a uniform gradient
@@ -190,9 +188,8 @@ def _slopes(
             xi = np.einsum("abn,bn->an", inverse, neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d])
             xi[:, ~joined] = 0.0
             change = neighbours_columns[: k * k] - own[: k * k]
-            for a in range(d):
-                B[a] += xi[a] * change
-                A[a] += xi[a] * xi
+            B += xi[:, None] * change
+            A += xi[:, None] * xi
             some |= joined
         A[axis, axis, ~some] += 1.0  # without a neighbour along this axis the slope is zero
     return np.einsum("abn,bmn->amn", _inverse(A), B).reshape(d, k, k, len(rows)), inverse

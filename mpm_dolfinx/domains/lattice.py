@@ -168,13 +168,14 @@ def _change(
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]
-            field[sites[(np.abs(field[sites] - d[part]) > tolerance).any(axis=1)]] = np.nan
+            differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
+            field[sites[np.logical_or.reduce(differs.T)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # the part of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
     change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
     change[np.isnan(change)] = 0.0
-    return exchange.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
+    return exchange.back(change.reshape(-1, values.shape[1] - 1).take(rows[0][0], axis=0))
 
 
 def _filtered(
@@ -240,10 +241,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed by a condition or fixed by a wall.
-
-    `walls` are the fixed components of each wall, by name.
-    """
+    """Return which components (n, 2^d, d) of corners a condition prescribes, or `walls` (name -> components) fix."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)

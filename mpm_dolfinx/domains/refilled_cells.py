@@ -33,7 +33,7 @@ GAP = 0.01
 Sensitivity (flow scene): half the value changes the result by 2.5e-05, twice by 0.0e+00, finer cells by 9.0e-02.
 """
 CRUMB = NEAR
-"""Area, as a fraction of the cell, below which a part is dropped.  Other parts receive its mass.  Source: as `NEAR`."""
+"""Area, as a fraction of the cell, below which a part is dropped; other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
 """Area limit, as a fraction of the cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
@@ -139,10 +139,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return cells that cannot be renewed.
-
-        These contain points that may not be renewed, several bodies, or faces with different conditions.
-        """
+        """Return cells that cannot be renewed: with other points, several bodies, or faces of different conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -409,10 +406,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k), 1/m, of values (points, k) in the cells of new domains.
-
-        The slopes are a least-squares fit to the values of the pieces in the cell.
-        """
+        """Return least-squares slopes (n, 2, k), 1/m, of values (points, k) of the pieces in cells of new domains."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)

@@ -212,7 +212,7 @@ class RainedFaces(OpenFaces):
     """Faces on open sides, at least one with rain.
 
     The outflow is minus the rain, but at least the outflow at the pond's pressure and at most that at the driest
-    pressure.  It includes seepage, so `seeps` is False.
+    pressure.  The outflow includes seepage, so `seeps` is False.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain

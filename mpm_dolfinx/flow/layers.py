@@ -2,9 +2,9 @@
 """Mobility of cells with several conductivities, from lines through the cell along each axis.
 
 Soils along a line are in series; lines are in parallel.  The mobility along an axis is the mean, over the lines, of the
-harmonic mean along each line (Cardwell and Parsons 1945).  It is exact for any number of layers parallel to the grid,
-for flow along and across them.  Inclined layers must be at least a cell thick: only then does a seam bar all lines of
-some cell, and does a drain contain complete lines.
+harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exact for any number of layers parallel to
+the grid, for flow along and across them.  Inclined layers must be at least a cell thick: only then does a seam bar all
+lines of some cell, and does a drain contain complete lines.
 
 The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  With
 s in [0, 1] along the line, the resistance to the lower end is int (1 - s) dR, to the upper end int s dR.  The sum

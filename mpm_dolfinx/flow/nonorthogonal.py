@@ -17,6 +17,7 @@ neighbours.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.flow.fluxes import CellContents, FluxForms, OpenSides
 from mpm_dolfinx.forms.point_forms import FacetSum
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
 """Offset of two centroids along a face, in cells, up to which they need no correction."""
@@ -69,7 +70,7 @@ class Gradients:
         share = contents.open
         towards = np.repeat(np.arange(d), 2)
         at, normal = contents.slot(sides.cells), sides.normal
-        tangential = sides.offset - np.einsum("md,md->m", sides.offset, normal)[:, None] * normal
+        tangential = _along(sides)
         neighbours = grid.neighbours(contents.filled)
         cells = np.maximum(neighbours, 0)
         inside = (neighbours >= 0) & (share[contents.filled] > 0)
@@ -81,7 +82,7 @@ class Gradients:
         along[:, np.arange(2 * d), towards] = 0.0
         h = grid.sizes(contents.filled)
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
-        off[at[_off_middle(sides, tangential / grid.sizes(sides.cells))]] = True
+        off[at[off_middle(sides, grid)]] = True
         self.rows = rows = np.flatnonzero(off)
         """Indices of the cells that need the correction, among the filled cells."""
         distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
@@ -98,10 +99,7 @@ class Gradients:
         self._tangential = tangential[self._faces]
         self._normal = normal[self._faces]
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
-        size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
-        at_sides = self._at[self._known]
-        weight = SIDES * size / sum_by(at_sides, size, len(rows))[at_sides]
-        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight)
+        self._contents, self._sides = contents, sides
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
         """Return the area vectors (n, d) of no-flow sides in the filled cells, relative to the faces of the cell."""
@@ -112,12 +110,13 @@ class Gradients:
             out[:, axis] -= area * grid.along(contents.filled, axis) / grid.volumes(contents.filled)
         return np.where(np.linalg.norm(out, axis=1, keepdims=True) > ALONG, out, 0.0)
 
-    def _units(
-        self, sealed: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return gradients (n, 2 d, d) and (m, d), 1/m, for a unit difference to one neighbour or to one side."""
+    @cached_property
+    def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gradients (n, 2 d, d) and (m, d), 1/m, for a unit difference to one neighbour or to one side."""
         known, d = self._known, self._separation.shape[2]
-        at = self._at[known]
+        at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
+        size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
+        weight = SIDES * size / sum_by(at, size, len(self.rows))[at]
         offset = self._offset[known]
         near = np.broadcast_to((NEAREST * self._grid.sizes(self._own).min(axis=-1)) ** 2, len(self._own))
         squared = np.maximum((self._separation**2).sum(axis=2), near[:, None])
@@ -146,15 +145,16 @@ class Gradients:
         weight : (d,), N/m^3
             Unit weight of the fluid; None without gravity.
         """
+        of_cells, of_sides = self._units
         own, at = p[self._own], self._at[self._known]
         to_cells = p[self._neighbours] - own[:, None]
         to_sides = outer[self._faces[self._known]] - own[at]
         if weight is not None:
             to_cells, to_sides = to_cells - self._separation @ weight, to_sides - self._offset[self._known] @ weight
         to_cells = np.where(self._inside, to_cells, 0.0)
-        out = np.einsum("nk,nki->ni", to_cells, self._of_cells)
+        out = np.einsum("nk,nki->ni", to_cells, of_cells)
         for axis in range(out.shape[1]):
-            out[:, axis] += sum_by(at, to_sides * self._of_sides[:, axis], len(out))
+            out[:, axis] += sum_by(at, to_sides * of_sides[:, axis], len(out))
         low, high = to_cells.min(axis=1, initial=0.0), to_cells.max(axis=1, initial=0.0)
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
@@ -198,13 +198,16 @@ class NonorthogonalFlow(NamedTuple):
         return outflow[filled], through
 
 
-def _off_middle(sides: OpenSides, off: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether the side of each face (m,), all faces of a condition in its cell, is not opposite the centroid.
-
-    off (m, d): vectors along the faces from the feet of the centroids, in cells.
-    """
+def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
+    """Return for each face (m,) whether its condition's faces in the cell are not opposite the cell's centroid."""
     _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
     at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
     count = int(at.max(initial=-1)) + 1
+    off = _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, count) / sum_by(at, size, count)
     return (np.abs(mean) > ALONG).any(axis=0)[at]
+
+
+def _along(sides: OpenSides) -> NDArray[np.float64]:
+    """Return vectors (m, d), m, along the faces, from the foot of the cell's centroid to the face's centre."""
+    return sides.offset - np.einsum("md,md->m", sides.offset, sides.normal)[:, None] * sides.normal

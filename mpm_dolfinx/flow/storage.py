@@ -656,10 +656,9 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1]; the result is the fixed-stress operator if 0.  For a smooth pressure,
-            B K^-1 B^T is beta V.  It is half of this (at nu = 0) for a pressure that alternates along one axis, and
-            zero for a checkerboard. beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) /
-            (4 d) [p][q] <= beta V.
+            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
+            pressure, beta V / 2 (at nu = 0) for one that alternates along one axis, and zero for a checkerboard.
+            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

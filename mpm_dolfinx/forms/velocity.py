@@ -34,9 +34,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set own, the time increment (s), and past, a multiple of the current u, of the velocity.
-
-        `dofs` are the active degrees of freedom.
-        """
+        """Set own, the time increment (s), and past, a multiple of the current u, at the active dofs."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

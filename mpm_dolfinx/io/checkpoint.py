@@ -30,10 +30,10 @@ from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
-from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.state import State, Stay, Trend
 from mpm_dolfinx.stepping.step_memory import StepControl
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 12  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 13  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if domains will be cut again
@@ -168,6 +168,8 @@ def _arrays(state: State) -> dict[str, NDArray]:
         named["pieces"] = state.pieces.arrays
     if state.lines is not None:
         named["lines"] = state.lines
+    if state.trend is not None:
+        named["trend"] = vars(state.trend)
     if state.stay is not None:
         named["stay"] = {"points": vars(state.stay.points)}
         if state.stay.keeps is not None:
@@ -197,6 +199,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
                 raise ValueError("pieces: of_cell, start: do not fit the kept cut")
+        of_trend = _part(arrays, "trend/")
+        trend = Trend(**of_trend) if of_trend else None
+        if trend is not None:
+            _check_trend(trend, points)
         lines = _part(arrays, "lines/") or None
         if lines is not None:
             _check_lines(lines, simulation.grid)
@@ -221,6 +227,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             outcome=_like(outcome, now.outcome),
             stage=None,
             begins=note["begins"],
+            trend=trend,
             result=result,
             control=control,
             **dict(zip(NODAL, nodal, strict=True)),
@@ -344,6 +351,16 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
     arrays |= {"node": node, "values": values}
 
 
+def _check_trend(trend: Trend, points: MaterialPoints) -> None:
+    """Raise ValueError for a trend that does not belong to the points."""
+    (n, d), k = points.x.shape, len(trend.lengths)
+    right = k in (1, 2) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d, 1 + d)
+    if not right or not all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values()):
+        raise ValueError("trend: does not fit the points, or is not finite")
+    if not (trend.lengths > 0).all():
+        raise ValueError("trend: lengths: steps must be > 0")
+
+
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
     """Raise ValueError for arrays that do not describe pieces of the points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
@@ -362,7 +379,8 @@ def _without_rows(state: State) -> State:
     stay = state.stay
     if stay is not None:
         stay = Stay(stay.points.of(none), None if stay.keeps is None else stay.keeps[:0])
-    return replace(state, points=points, pieces=state.pieces and state.pieces.of(none), stay=stay)
+    trend = state.trend and replace(state.trend, rates=state.trend.rates[:0])
+    return replace(state, points=points, pieces=state.pieces and state.pieces.of(none), stay=stay, trend=trend)
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:

@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return names and values (n, ...) of the state at the end of a step; data contain F at the end; dt: s."""
+        """Return names and values (n, ...) of the state at the end of a step; data have F at the end; dt: step, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -216,9 +216,9 @@ Sensitivity (soil scene): half the value changes the result by 4.0e-03, twice by
 class SoftnessAtPoints:
     """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
 
-    Volume strains that alternate from cell to cell grow with the strain.  The alternating pressures that balance them
-    are these volume strains divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant
-    stress.  The coefficient must then grow with the softness, else the alternating pressures reach the soil's strength.
+    Volume strains that alternate from cell to cell grow with the strain.  The pressure that balances such a volume
+    strain is volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant
+    stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent shear modulus
     is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the

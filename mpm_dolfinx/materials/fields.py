@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import TINY
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
@@ -187,15 +187,17 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
+        if self.fluid is None and m.retention is not None:
+            raise ValueError(f"{law.__name__}: retention = {line(m.retention)}, must be None without a fluid")
         if "suction" in law.state and self.fluid is not None and m.retention is None:
             raise ValueError(f"{law.__name__}: retention = None, must be a retention curve for a law with suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
-            what = "has unknowns and takes cell_size, must not with cells of several sizes"
+            what = "has unknowns and depends on cell_size, must not be used with cells of several sizes"
             raise ValueError(f"{law.__name__}: {what}")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*constants_of(m), *law.state])
-                raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
+                raise ValueError(f"{law.__name__}: argument {name!r} of its functions, must be F or one of {known}")
             value = _known(f"{law.__name__}: {name}", getattr(m, name))
             self._set_shape(law, name, value.shape[1:])
         for name, value in law.state.items():
@@ -302,7 +304,7 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,): values at the points.
 
-        `value` returns one value per point, or a single value for a uniform material without columns.
+        `value` returns one value per point, or one number; for a uniform material without columns also one value (...).
         """
         each, shapes = [], set()
         for i in self._used:

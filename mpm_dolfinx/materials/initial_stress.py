@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints
 
 EXACT, CLOSE = 1e-13, SAME  # errors of the stress / largest initial stress: at which Newton's method ends, and allowed
 MOST = 30  # Newton iterations
@@ -201,10 +201,10 @@ class InitialStresses:
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
             g = None if gravity is None else np.asarray(gravity).tolist()
-            raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, must point down along the last axis at the start")
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
-            raise ValueError("initial_stress: K0 without gravity at the start, nor a surcharge: must have one of these")
+            raise ValueError("initial_stress: K0 without gravity at the start or surcharge, must have one of them")
         # the densities of all points on all processes
         seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.present_density(seeded)
@@ -221,8 +221,7 @@ def stressed(
 ) -> MaterialPoints:
     """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter; in other laws elastic strain causes it, see
-    `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter; in other laws elastic strain: `_ElasticStrains`.
 
     Raises
     ------
@@ -254,17 +253,13 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved.
-
-    points: n points; target (n, 3, 3): stress, Pa.
-    given (n,): whether the stress is a parameter; plastic (n,): whether C_p^-1 is a state variable.
-    """
+    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved."""
 
     materials: SceneMaterials
-    points: MaterialPoints
-    target: NDArray[np.float64]
-    given: NDArray[np.bool_]
-    plastic: NDArray[np.bool_]
+    points: MaterialPoints  # n points
+    target: NDArray[np.float64]  # (n, 3, 3) stress, Pa
+    given: NDArray[np.bool_]  # (n,) whether the stress is a parameter
+    plastic: NDArray[np.bool_]  # (n,) whether C_p^-1 is a state variable
 
     @property
     def components(self) -> tuple[tuple[int, int], ...]:
@@ -351,7 +346,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
     F = moved.F_of_laws
     d = F.shape[1]
     law = materials.law_of(points)
-    own = {name: points.data[name] for name in ("softness", "owed", "due", ACROSS) if name in points.data}
+    own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
     whole = np.tile(np.eye(3), (len(F), 1, 1))
@@ -381,6 +376,11 @@ def _kappa(m) -> NDArray[np.float64]:
     return m.kappa if isinstance(m, ModifiedCamClay) else np.ones(np.shape(m.bulk))
 
 
+def _friction(m) -> NDArray[np.float64]:
+    """Return the friction angle, degrees, nan for laws without one."""
+    return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
+
+
 def _prestretch(m) -> NDArray[np.float64]:
     return m.prestretch if isinstance(m, ModifiedCamClay) else np.ones((*np.shape(m.bulk), 3))
 
@@ -399,4 +399,12 @@ def _outside_yield(materials: SceneMaterials, points: MaterialPoints, target: ND
     allowed = f"inside the yield surface of {name}"
     tension = np.trace(target[i]) > 0  # the pore pressure exceeds the overburden
     more = "; K0 needs the weight of open water as surcharge" if tension and points.pressure[i] > 0 else ""
-    return f"initial_stress at {points.x[i] + materials.grid.base}: {target[i].tolist()} Pa, must be {allowed}{more}"
+    friction = materials.table(points, _friction)[i]
+    if np.isfinite(friction):
+        ratio = np.tan(np.radians(45 + friction / 2)) ** 2
+        allowed += (
+            f": without cohesion, friction = {friction:.4g} degrees allows K0 from {1 / ratio:.3g} to {ratio:.3g}"
+        )
+    stress = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(target[i]))
+    where = points.x[i] + materials.grid.base
+    return f"initial_stress at {where}: principal stresses {stress} Pa, must be {allowed}{more}"

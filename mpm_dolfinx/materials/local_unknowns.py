@@ -9,8 +9,7 @@ with errors of round-off.  The forms contain
 with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress with respect to y
 and F is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  If the
 stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.  Then y
-has a second-order term, whose coefficients also follow from f = 0.  A law may instead return y(z) and its derivative in
-numpy.
+has a second-order term, whose coefficients also follow from f = 0.  A law in numpy may instead return y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -37,19 +36,19 @@ MOST, HALVINGS = 60, 25  # Newton iterations, and step halvings in all iteration
 
 
 class Solved(NamedTuple):
-    """Solution at some points: key of their data; unknowns (n, m); trial values (n, k); function for derivatives."""
+    """Solution of the local equations at n points."""
 
-    key: object
-    unknowns: NDArray[np.float64]
-    trial: NDArray[np.float64]
-    derive: Callable[[], Derived]
+    key: object  # of the points' data
+    unknowns: NDArray[np.float64]  # (n, m)
+    trial: NDArray[np.float64]  # trial values (n, k)
+    derive: Callable[[], Derived]  # function that returns the derivatives
 
 
 class Derived(NamedTuple):
-    """Derivatives with respect to the trial values: slopes Y (n, m k); for laws with an energy bends (n, m k k)."""
+    """Derivatives of the unknowns with respect to the trial values, at n points."""
 
-    slopes: NDArray[np.float64]
-    bends: NDArray[np.float64] | None = None
+    slopes: NDArray[np.float64]  # first derivatives Y (n, m k)
+    bends: NDArray[np.float64] | None = None  # second derivatives (n, m k k), for laws with an energy
 
 
 class LocalUnknowns:
@@ -82,7 +81,7 @@ class LocalUnknowns:
         given = {"trial": trial}
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
         if not trial:
-            raise ValueError(f"{law.__name__}.trial: gives {line(given['trial'])}, must have some UFL of F")
+            raise ValueError(f"{law.__name__}.trial: returns {line(given['trial'])}, must have some UFL of F")
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()
@@ -129,7 +128,7 @@ class LocalUnknowns:
     def _at(self, data: PointData) -> Solved:
         solved = self._solved.value
         if solved is None or solved.key is not data.key:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are solved")
+            raise RuntimeError(f"{self._law.__name__}: local unknowns are used before they are solved")
         return solved
 
     def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
@@ -138,7 +137,7 @@ class LocalUnknowns:
             return getattr(solved, what)
         of, derived = self._derived.value or (None, None)
         if of is not solved:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are derived")
+            raise RuntimeError(f"{self._law.__name__}: derivatives of local unknowns are used before they are computed")
         return getattr(derived, what)
 
 
@@ -279,14 +278,14 @@ class _Equations:
                 raise ValueError(f"{self._title}: {of} = {line(pair)}, {allowed}")
         if set(found) != set(self._unknowns):
             names = (", ".join(map(str, of)) or "nothing" for of in (found, self._unknowns))
-            raise ValueError("{}: gives {}, must give {}".format(self._title, *names))
+            raise ValueError("{}: returns {}, must return {}".format(self._title, *names))
         out = {}
         for of, shape in self._unknowns.items():
             values, slopes = found[of]
             for by in slopes:
                 if by not in self._trial:
                     among = ", ".join(self._trial)
-                    raise ValueError(f"{self._title}: derivative of {of} by {line(by)}, must be by some of {among}")
+                    raise ValueError(f"{self._title}: derivative of {of} by {line(by)}, must be by one of {among}")
             known = {by: slope if callable(slope) else self._slope(of, by, slope, n) for by, slope in slopes.items()}
             out[of] = _real(f"{self._title}: {of}", values, (n, *shape)), known
         return out
@@ -327,8 +326,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return the failed points.
 
-    system: function of point indices (r,) and values (r, m).  It sets the values, and returns f (r, m), df/dy (r, m, m)
-    and norms of f (r,).
+    system: function of indices (r,) and values (r, m).  It sets the values, and returns f, df/dy and norms of f (r,).
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
@@ -341,10 +339,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
         y[rows] = old - step  # for close points this is the solution
         on = ~(close | failed[rows])
-        rows = rows[on]
-        step = step[on]
-        old = old[on]
-        norm = norm[on]
+        rows, step, old, norm = (values[on] for values in (rows, step, old, norm))
         length = np.ones(int(on.sum()))
         if not len(rows):
             break
@@ -355,9 +350,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
             f[worse], slope[worse], new[worse] = system(rows[worse], old[worse] - length[worse, None] * step[worse])
         failed[rows] = ~(new < norm)
         on = ~failed[rows]
-        rows = rows[on]
-        f = f[on]
-        slope = slope[on]
+        rows, f, slope = (values[on] for values in (rows, f, slope))
         norm = new[on]
     failed[rows] = True  # after so many iterations
     return np.flatnonzero(failed)

@@ -233,7 +233,7 @@ class _Return:
         return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return quantities that are >= 0 if an ordered plastic strain x is in the cone of the six faces' flows."""
+        """Return quantities that are >= 0 if an ordered plastic strain x is in the cone of all six flow directions."""
         total, difference = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 

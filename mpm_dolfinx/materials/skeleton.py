@@ -191,7 +191,7 @@ class Skeleton:
         drains = getattr(self.conductivity_law, "specific_yield", 0.0)
         if drains and self.retention is not None:
             raise ValueError(
-                f"{type(self).__name__}: retention beside a specific yield {drains:g}, must be one of them"
+                f"{type(self).__name__}: retention and a specific yield {drains:g}, must be only one of them"
             )
         _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):
@@ -447,8 +447,7 @@ class unsaturated:
     The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
     is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
-    steps of about (cell size)^2 / (coefficient of consolidation), and a free surface must cross less than a cell a
-    step.
+    steps of about (cell size)^2 / (coefficient of consolidation), in which a free surface crosses less than a cell.
 
     Parameters
     ----------

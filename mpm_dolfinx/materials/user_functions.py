@@ -82,11 +82,11 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
         apply_algebra_lowering(out)  # here UFL detects most errors
     except Exception as error:  # UFL has several kinds
         why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
-        raise ValueError(f"{_name(function)}: gives {line(value)}{why}, must be {allowed}") from error
+        raise ValueError(f"{_name(function)}: returns {line(value)}{why}, must be {allowed}") from error
     if out.ufl_shape not in shapes:
-        raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
+        raise ValueError(f"{_name(function)}: returns shape {out.ufl_shape}, must be {allowed}")
     if of and not any(part is available[of] for part in unique_pre_traversal(out)):
-        raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
+        raise ValueError(f"{_name(function)}: returns {line_of(out)}, must be {allowed}")
     _check_parts(_name(function), out)
     return out
 
@@ -101,7 +101,7 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
             for factor in part.ufl_operands:
                 for index, size in zip(factor.ufl_free_indices, factor.ufl_index_dimensions, strict=True):
                     if sizes.setdefault(index, size) != size:
-                        raise ValueError(f"{what}: sums over {sizes[index]} and {size} components, must be as many")
+                        raise ValueError(f"{what}: index of sizes {sizes[index]} and {size}, must be of one size")
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
@@ -122,9 +122,9 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
         _check_parts(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
     if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
-        raise ValueError(f"{what}: gives {found}, must have {allowed}")
+        raise ValueError(f"{what}: returns {found}, must have {allowed}")
     if not any(extract_coefficients(value) for value in out.values()):
-        raise ValueError(f"{what}: gives numbers alone, must be UFL that depends on its arguments")
+        raise ValueError(f"{what}: returns only numbers, must be UFL that depends on its arguments")
     return out
 
 
@@ -139,10 +139,10 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
     out, dx = call(function, **available), available["points"].dx
     allowed = "a form with points.dx"
     if not isinstance(out, ufl.Form):
-        raise ValueError(f"{kind}: {_name(function)} gives {line(out)}, must be {allowed}")
+        raise ValueError(f"{kind}: {_name(function)} returns {line(out)}, must be {allowed}")
     for integral in out.integrals():
         if (integral.integral_type(), integral.subdomain_id()) != (dx.integral_type(), dx.subdomain_id()):
-            raise ValueError(f"{kind}: {_name(function)} gives an integral over the grid, must be {allowed}")
+            raise ValueError(f"{kind}: {_name(function)} returns an integral over the grid, must be {allowed}")
         _check_parts(f"{kind}: {_name(function)}", integral.integrand())
     return out
 

@@ -43,7 +43,7 @@ RATIO = 0.3
 Sensitivity (soil scene): half the value changes the result by 1.3e-03, twice by 5.9e-04, finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Strength of the penalty with integration at the points; volume fraction of cells below which their faces have it."""
+"""Strength of the penalty with integration at the points; volume fraction below which faces of a cell have it."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:

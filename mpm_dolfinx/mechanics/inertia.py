@@ -51,7 +51,7 @@ GHOST_MASS = 0.02
 `tests/test_inertia.py` tests this.
 """
 RELAXES = 2.0
-"""Relaxation rate of point velocities towards grid velocities, per cell size that the domain's corners have moved.
+"""Relaxation rate of point velocities towards grid velocities, per cell size of motion of the domain's corners.
 
 Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
 moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates
@@ -83,9 +83,9 @@ def checked_velocity(
         return None
     flag("inertia", inertia)
     if quadrature != "domain":
-        raise ValueError(f"inertia = {inertia}: not with quadrature {quadrature!r}, must be left out")
+        raise ValueError(f"inertia = {inertia} with quadrature {quadrature!r}, must be None")
     if velocity is not None and not inertia:
-        raise ValueError(f"velocity = {line(velocity)}: bodies are at rest at first, must be given with inertia=True")
+        raise ValueError(f"velocity = {line(velocity)}: no inertia at first, must be given with inertia=True")
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
     elif grid.axisymmetric and velocity is not None and np.ravel(velocity)[:1].any():
@@ -425,11 +425,11 @@ class Inertia(Loads):
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns at the start of a step and after a substep, m/s; last acceleration, m/s^2."""
+    """Velocities and acceleration of the unknowns within a step."""
 
-    start: PETSc.Vec
-    velocity: PETSc.Vec
-    acceleration: PETSc.Vec | None = None
+    start: PETSc.Vec  # velocities at the start of the step, m/s
+    velocity: PETSc.Vec  # velocities after the last substep, m/s
+    acceleration: PETSc.Vec | None = None  # of the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
         """Return the inertial predictor of the next substep, m; own, before: weights of this and the last rate, s."""

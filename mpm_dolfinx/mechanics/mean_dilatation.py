@@ -12,7 +12,7 @@ materials that would not lock use F. The energy sum w psi(Fbar) / J_n has the de
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-For given (theta, pi) the residual has one more term, the energy's, and the tangent is symmetric. The contribution of
+For given (theta, pi) the residual has the additional term with pi, and a symmetric tangent. The contribution of
 theta and pi has rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material point method:
 Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar. The next step
 starts from a J_n computed from the particle domains in the cell (`cell_ratios`).

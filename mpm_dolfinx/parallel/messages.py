@@ -47,7 +47,7 @@ def set_log_level(level: int | str) -> None:
     try:
         logger.setLevel(level)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"level = {level!r}, must be one of logging's, such as 'INFO'") from error
+        raise ValueError(f"level = {level!r}, must be a level of logging, such as 'INFO'") from error
     if not logger.hasHandlers():
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("mpm_dolfinx: %(message)s"))

@@ -29,32 +29,28 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
-"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` may have an open face. Source: epsilon."""
+"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
 TANGLED = 0.2  # volume between the corners / volume of the domain; below it corners are re-initialised from F
 
 
 @dataclass
 class Pieces:
-    """Pieces of particle domains; arrays for m pieces, ordered by point and cell.
+    """Pieces of particle domains; arrays for m pieces, ordered by point and cell."""
 
-    point (m,): index of the domain; cell (m,): lexicographic number of the cell.
-    fraction (m,): volume / volume of the domain; x (m, d): centroid, m.
-    faces (m, d, 2): area of the piece on the lower and upper face of its cell along each axis, m^(d-1).
-    mixed (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2.
-    hoop (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
-    product of its components, m^2; radius of this centroid, m.
-    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for
-    pieces with symmetric sections.
-    """
-
-    point: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    fraction: NDArray[np.float64]
-    x: NDArray[np.float64]
+    point: NDArray[np.int64]  # (m,) index of the domain
+    cell: NDArray[np.int64]  # (m,) lexicographic number of the cell
+    fraction: NDArray[np.float64]  # (m,) volume of the piece / volume of the domain
+    x: NDArray[np.float64]  # (m, d) centroid, m
+    # (m, d, 2) on request, else (m, 0, 2): area on the lower and upper face of the cell along each axis, m^(d-1)
     faces: NDArray[np.float64]
+    # (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2
     mixed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    # (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
+    # product of the components of this offset, m^2; radius of this centroid, m
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    # (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces
+    # with symmetric sections
     second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -191,22 +187,22 @@ def _chunks(count: int, dim: int) -> list[slice]:
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
 
-def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Pieces:
+def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
         Corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
-    second
-        Whether to compute second moments of the pieces.
+    second, faces
+        Whether to compute second moments and face areas of the pieces.
 
     Returns
     -------
     The pieces.  Pieces below 1e-12 of their domain are left out; the fractions of every domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
-    parts = [_cut(grid, corners[chunk], second) for chunk in chunks]
+    parts = [_cut(grid, corners[chunk], second, faces) for chunk in chunks]
     for chunk, part in zip(chunks, parts, strict=True):
         part.point += chunk.start
     columns = zip(*([getattr(part, f.name) for f in fields(Pieces)] for part in parts), strict=True)
@@ -247,7 +243,7 @@ def slices_in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
+def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) -> Pieces:
     d, true = grid.dim, np.ascontiguousarray(grid.in_cells(corners).transpose(1, 2, 0))
     x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
     in_cells, y = on_planes(grid, true, x, 1)
@@ -274,8 +270,8 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
         s, facet = sliced(s, facet, axis, grid)
     s = slices_in_cells(grid, s)
     area = _area_vectors(s)
-    area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has changed the order of vertices
-    return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second)
+    area *= np.sign((area * outward.take(facet, axis=1)).sum(axis=0))  # slicing has changed the order of vertices
+    return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second, faces)
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -321,8 +317,11 @@ class _Slots:
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the slots (m,) of cells with indices (d, m), for the domains `owner` (m,)."""
-        place = index.astype(np.int64) - self.low[:, owner]
-        return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
+        before = self._start - (self.low * self._stride).sum(axis=0)
+        out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
+        for place, stride in zip(index[:-1], self._stride, strict=False):
+            out += place.astype(np.int64) * stride.take(owner)
+        return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """Return, for each slot, the sum of the values of the slots further along an axis in the same column."""
@@ -340,6 +339,7 @@ def _sum(
     area: NDArray[np.float64],
     owner: NDArray[np.int64],
     second: bool,
+    faces: bool,
 ) -> Pieces:
     """Sum the slices of the surfaces to one piece for each domain and cell."""
     d = grid.dim
@@ -350,7 +350,7 @@ def _sum(
     for a in range(d):
         # a slice on a grid plane belongs to the cell that contains the body
         index[a] -= (area[a] > 0) & (most[a] == index[a])
-        np.minimum(np.maximum(index[a], slots.low[a][owner]), slots.high[a][owner], out=index[a])
+        np.minimum(np.maximum(index[a], slots.low[a].take(owner)), slots.high[a].take(owner), out=index[a])
         flat = most[a] - least[a] < grid.snap[a]  # rounding may snap only one of two touching domains: factor 2 below
         lower = (flat & (area[a] < 0) & (most[a] - index[a] < 2 * grid.snap[a])).nonzero()[0]
         upper = (flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * grid.snap[a])).nonzero()[0]
@@ -383,7 +383,7 @@ def _sum(
     size = volume if grid.even else volume * grid.widths_of(slots.cell.T).prod(axis=1)
     whole = sum_by(slots.point, size, len(slots.low[0]))[slots.point]
     kept = (size / whole > SLIVER).nonzero()[0]
-    point, cell = slots.point[kept], slots.cell[:, kept].T
+    point, cell = slots.point[kept], slots.cell.take(kept, axis=1).T
     h = grid.widths_of(cell).T  # (d, m), or of equal cells (d,)
     if grid.axisymmetric:
         x0, x1 = x[:, 0]
@@ -396,14 +396,13 @@ def _sum(
             area[1] *= grid.low[0] + grid.h[0] * r  # sections normal to the axis of revolution are rings too
         else:
             area[1] *= grid.lines[0][index[0].astype(int)] + grid.widths[0][index[0].astype(int)] * (r - index[0])
-    faces = np.empty((len(kept), d, 2))
-    for a in range(d):
+    sections = np.empty((d * faces, 2, len(kept)))
+    for a, section in enumerate(sections):
         shadow = total(area[a]) if a else shadow
         beyond = slots.beyond(shadow, a)
         lower, upper = (total(area[a], chosen) for chosen in ends[a])
         # areas of the body's sections just above the lower and just below the upper face
-        faces[:, a] = np.array([beyond + shadow - lower, beyond + upper]).T[kept]
-        faces[:, a] *= grid.cell_volume / h[a] if grid.even else (h.prod(axis=0) / h[a])[:, None]
+        np.multiply([(beyond + shadow - lower)[kept], (beyond + upper)[kept]], h.prod(axis=0) / h[a], out=section)
 
     # centroids are kept away from grid lines, inside the cell of the piece
     volume = volume[kept]
@@ -422,8 +421,9 @@ def _sum(
     )
     if grid.axisymmetric:
         ends = cell[:, [0]] + [0, 1]
-        faces[:, 0] *= TURN * (grid.low[0] + grid.h[0] * ends if grid.even else grid.lines[0][ends])
-        faces[:, 1] *= TURN
+        if faces:
+            sections[0] *= TURN * (grid.low[0] + grid.h[0] * ends if grid.even else grid.lines[0][ends]).T
+            sections[1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
         volume = volume * radius if grid.even else volume * h.prod(axis=0) * radius
         spread = of_rings(spread, hoop[:, 3])
@@ -431,7 +431,8 @@ def _sum(
         volume = volume * h.prod(axis=0)
     fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.places(cell, centroid)
     moments = spread if second else np.empty((len(kept), 0))
-    return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop, moments)
+    areas = np.ascontiguousarray(np.abs(sections).transpose(2, 0, 1))
+    return Pieces(point, grid.number(cell), fraction, x, areas, mixed, hoop, moments)
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
@@ -653,9 +654,9 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
         crossing = t.max(axis=0) > plane
         if not crossing.any():
             break
-        done_s.append(s[:, :, ~crossing])
+        done_s.append(s.compress(~crossing, axis=2))
         done_owner.append(owner[~crossing])
-        below, below_owner, s, owner = cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
+        below, below_owner, s, owner = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
         done_s.append(below)
         done_owner.append(below_owner)
     return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
@@ -671,7 +672,7 @@ def cut_at(s, owner, axis: int, plane):
     owners = {"below": [owner[:0]], "above": [owner[:0]]}
     for k in range(1, dim + 1):
         chosen = (count == k).nonzero()[0]
-        v, c = s[:, :, chosen], plane[chosen]
+        v, c = s.take(chosen, axis=2), plane[chosen]
         points = {(i,): v[i] for i in range(dim + 1)}
         for i in range(k):
             for j in range(k, dim + 1):

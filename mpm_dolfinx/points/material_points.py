@@ -72,7 +72,7 @@ def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return det F F^-T (n, d, d) of F (n, d, d); numpy's inverse takes ten times as long."""
     if F.shape[1] == 2:
-        flat = F.reshape(-1, 4)[:, [3, 2, 1, 0]] * [1.0, -1.0, -1.0, 1.0]
+        flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
     return np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
 
@@ -118,6 +118,8 @@ class MaterialPoints:
     origin: NDArray[np.float64]
     reference: NDArray[np.float64]
     data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    INTERNAL = (ACROSS, "owed", "due", "softness")
+    """Names of data that only the method needs."""
 
     def __post_init__(self):
         object.__setattr__(self, "data", MappingProxyType(dict(self.data)))

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -21,14 +22,11 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Connected parts of the bodies on the grid.
+    """Connected parts of the bodies on the grid."""
 
-    count: number of parts; cells, nodes (n,): part of each active local cell and node, from 0, else -1.
-    """
-
-    count: int
-    cells: NDArray[np.int64]
-    nodes: NDArray[np.int64]
+    count: int  # number of parts
+    cells: NDArray[np.int64]  # part of each active local cell, from 0, else -1
+    nodes: NDArray[np.int64]  # part of each active local node, from 0, else -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +58,7 @@ class OfParts:
         """Return the sums (..., count) of the entries (..., n) of each part, over all processes."""
         order, start, present = self._sorted
         out = np.zeros((*values.shape[:-1], self.count))
-        out[..., present] = np.add.reduceat(values[..., order], start, axis=-1)
+        out[..., present] = np.add.reduceat(values.take(order, axis=-1), start, axis=-1)
         return over_all(self.comm, out)
 
     def norms(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,9 +89,9 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     first cells, in the same way on any number of processes.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
-    nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
-    own, count = _joined(np.arange(len(cells)).repeat(2**grid.dim), at.ravel(), (len(cells), len(nodes)))
+    own, count = _touching(grid.cell_places(cells))
     if grid.comm.size > 1:
+        nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
         of_node = np.zeros(len(nodes), dtype=np.int64)
         of_node[at.ravel()] = own.repeat(2**grid.dim)
         own, count = _over_processes(grid, own, count, nodes, of_node)
@@ -103,6 +101,19 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     place[over_all(grid.comm, first, MPI.MIN).argsort()] = np.arange(count)
     out[cells] = place[own] + 1
     return out, count
+
+
+def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return the connected part (n,), from 0, of cells by indices and copy (n, d + 1), and the number of parts."""
+    if not len(index):
+        return np.empty(0, dtype=np.int64), 0
+    low = index.min(axis=0)
+    at, box = tuple((index - low).T), np.zeros(index.max(axis=0) - low + 1, dtype=bool)
+    box[at] = True
+    around = np.zeros((3,) * index.shape[1], dtype=bool)
+    around[..., 1] = True  # copies have no nodes in common
+    number, count = label(box, around)
+    return number[at].astype(np.int64) - 1, count
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:

@@ -244,7 +244,7 @@ def scale_of(law) -> float:
             suction *= 2
         if half(suction):
             return suction
-    raise ValueError(f"{line(law)}: saturation never falls to a half, must do so or have a scale, Pa")
+    raise ValueError(f"{line(law)}: saturation never falls to 0.5, must fall to 0.5, or the law must have a scale, Pa")
 
 
 class Retentions:

@@ -135,8 +135,7 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which cells (m, cells) the fit uses, and which are connected to the probe's cell by open faces.
 
-        If no cell contains only the probe's soil, as in thin layers or graded soil, the fit uses cells of the probe's
-        material, or else all cells.
+        If no cell contains only the probe's soil, as in thin layers, the fit uses cells of its material, or else all.
 
         same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """
@@ -234,8 +233,7 @@ class _Around:
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
         """Return probes, offsets, heads and weights at drained sides in the fit, and whether in the probe's cell.
 
-        Each side of a cell gives the fit one head, the mean over its faces. Separate heads would cause spurious
-        gradients along the side.
+        Each side of a cell gives the fit one head, the mean over its faces. Separate heads would cause false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))

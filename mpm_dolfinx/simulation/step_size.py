@@ -205,7 +205,7 @@ class Times:
         test, allowed = lambda v: (v >= least) & (v < inf), f"{more} {now:g} s and finite"
         self.end = float(numbers("t_end", end, allowed=allowed, test=test))
         if interval is None and rtol is None:
-            raise ValueError("dt = None: must be given, or rtol for steps that are chosen by their error")
+            raise ValueError("dt = None, must be given, or rtol for adaptive steps")
         if given is not None and interval is not None and rtol is not None:
             raise ValueError(
                 f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
@@ -272,16 +272,16 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if rtol is None:
         for name, value in {"first_step": first_step, "max_step": max_step if max_step != inf else None}.items():
             if value is not None:
-                raise ValueError(f"{name} = {line(value)}: needs rtol, for steps that are chosen by their error")
+                raise ValueError(f"{name} = {line(value)}, must be given with rtol, for adaptive steps")
         return StepSize(times.interval, times.interval)
     least = RESOLVED * scene.scheme.tolerance
-    numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
+    numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1), >= {RESOLVED} tolerance")
     if scene.numerics.method == "backward-euler":
-        raise ValueError(f"rtol = {line(rtol)}: backward-euler has no error estimate, must be sdirk2")
+        raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
-        raise ValueError(f"rtol = {line(rtol)}: without flow there is no error estimate for velocities, must be dt")
+        raise ValueError(f"rtol = {line(rtol)}: without flow velocities have no error estimate, must be dt alone")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error

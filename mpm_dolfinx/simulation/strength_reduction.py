@@ -185,9 +185,9 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
         if rests(trial) != begins:
             return min(known, trial), max(known, trial)
         known = trial
-    found = "come to rest" if begins else "slide"
-    more = "" if begins else "; loads must be constant in time"
-    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor{more}")
+    found, allowed = ("come to rest", "slide") if begins else ("slide", "come to rest")
+    allowed += " at some factor" if begins else " at some factor; loads must be constant in time"
+    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must {allowed}")
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
@@ -231,7 +231,7 @@ class _Weakened:
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
         if scene.grid.copies > 1:
-            raise ValueError("factor_of_safety: contacts: must be none")
+            raise ValueError("factor_of_safety: the scene has contacts, must have none")
         initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data that belong to its grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
@@ -320,7 +320,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
     sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
     total, rounding, whole_volume = over_all(grid.comm, sums)
     if not total > rounding:
-        raise ValueError("factor_of_safety: the bodies have no stress, must be at rest under loads")
+        raise ValueError("factor_of_safety: the bodies have no stress, must be in equilibrium under loads")
     return float(total / whole_volume)
 
 

@@ -28,7 +28,8 @@ class Tangent:
     Parameters
     ----------
     stiffness : (n, n)
-        Stiffness, with ghost penalty and penalties of prescribed displacements and contacts; without fixed components.
+        Stiffness, with ghost penalty and penalties of prescribed displacements and contacts; without fixed components
+        and without the inertia of bodies. Free tools move with the bodies, against their own inertia.
     nodes, components : (n,)
         Grid node and axis of each displacement.
     x : (n, d)
@@ -50,7 +51,7 @@ class Tangent:
 
 
 def tangent(simulation: Simulated, dt: float) -> Tangent:
-    """Return the tangent at the present state, for a step of dt, s, > 0, that starts now; see `Tangent`.
+    """Return the tangent at the present state; dt: length of the step that starts now, s, > 0; see `Tangent`.
 
     Raises
     ------
@@ -62,7 +63,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     if scene.grid.comm.size > 1:
         raise ValueError(f"tangent: has matrices of one process, not of {scene.grid.comm.size}")
     start = set_up(scene, state, dt)
-    acting = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
+    acting = start.begun(start.acting[-1]._replace(substep=METHODS["backward-euler"][0]), None)
     both = balances(scene, start, acting)
     momentum, storage = both.momentum, both.storage
     momentum.assemble_residual()

@@ -128,8 +128,7 @@ def run(
     ValueError
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        A step failed at any length; the exception has the histories so far. `points` and `t` belong to the last good
-        step.
+        A step failed at any length; the exception has the histories so far. `points` and `t` are of the last good step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -239,7 +238,7 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
     if raised is not None:
         raise raised
     if where:
-        raise RuntimeError(f"observe: {line(observer)} has raised an error on {where}")
+        raise RuntimeError(f"observe: {line(observer)} raised an error on {where}")
 
 
 def _histories(
@@ -255,7 +254,7 @@ def _histories(
         fresh = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), fresh
     if latest is None or control is None or after.rows.run is not latest.rows.run:
-        raise ValueError("after: histories of another run, must be of the last one, or a result of `resume`")
+        raise ValueError("after: histories of another run, must be histories of the last run, or a result of `resume`")
     after = latest  # the run may have advanced since `after`
     now = state.t
     start = after.rows[0]
@@ -266,7 +265,7 @@ def _histories(
         raise ValueError(f"{what}, t = {last!r}; for other steps, or t_eval, start new histories, without after")
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
-        raise ValueError(f"probes: the run to continue has {recorded} of them")
+        raise ValueError(f"probes: {count} probes, must be {recorded}, as in the run to continue")
     if count and probes.stressed != (len(start.probe_stress) > 0):
         raise ValueError(f"probes: stress = {probes.stressed}, must be as in the run to continue")
     return after, control

@@ -5,7 +5,7 @@ PETSc's own factors of displacement matrices, with a block for each node, take a
 With 44000 unknowns in 2D and minimum degree ordering the first factorisation takes 110 ms, the next with the same
 pattern 60 ms (scalar 430 and 150; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290). A solve takes 4 ms
 (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two processes MUMPS takes
-as long, and 25 ms a solve. With few processes, one process therefore holds the factors of displacements, which many
+as long, and 25 ms for a solve. With few processes, one process therefore holds the factors of displacements, which many
 solves use. Another holds the factors of pressures, computed at the same time. With both factorised on all of four
 processes, which share the memory's bandwidth, the factorisations took 1.7 times as long.
 

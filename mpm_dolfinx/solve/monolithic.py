@@ -14,13 +14,14 @@ cycles. MINRES with the diagonal blocks took 17 to 23 cycles, and left five time
 iterations to 1e-5, 12 with AMG on P.
 
 At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells. If a solve takes too many iterations (see
-`plan`), or is predicted to, factors of K replace the cycle. They are kept until a solve with them takes too many: for
-other tangents of the step about 10. A step takes 6.2 s, and 8.5 s with factors of each tangent (4 to 6 iterations).
-Four steps of yielding soil, 12^3 cells, take 33 and 41 s. MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s
-(PETSc in 3.4 s). Solves then take at most 19 iterations, at nu = 0.49 with contrasts of 1e3 at most 22.
+`plan`), or is predicted to, factors of K replace the cycle, and are kept until a solve with them takes too many.  With
+other tangents of the step a solve takes about 10. A step takes 6.2 s, with new factors for each tangent 8.5 s (4 to 6
+iterations). Four steps of yielding soil, 12^3 cells, take 33 s, with new factors 41 s. MUMPS factorises 3190 unknowns
+in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s). Solves then take at most 19 iterations, at nu = 0.49 with contrasts of 1e3 at
+most 22.
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
-wide, and coarse grids cannot represent them. With a viscosity of 0.05 it takes 28. Its time is 0.9 times that of a
+wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28. Its time is 0.9 times that of a
 direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage, p -> p + k B
 u, K is as at nu = 0.3, but alternating pressures have almost no stiffness: 500 iterations.
 """

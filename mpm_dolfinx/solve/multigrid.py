@@ -139,9 +139,7 @@ def interpolation(
     number, owned = _shared(comm, keys, int(np.prod(shape)), stated)
     column = number[at[: len(coarse)]]
     kept = column != NONE
-    rows = rows[kept]
-    column = column[kept]
-    weights = weights[kept]
+    rows, column, weights = (values[kept] for values in (rows, column, weights))
     if not nodal:
         weights = weights / np.bincount(rows, weights, len(places))[rows]
     Q = scipy.sparse.coo_matrix((weights, (rows, column)), shape=(len(places), column.max(initial=-1) + 1)).tocsr()
@@ -186,8 +184,7 @@ def _shared(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers (n,) of coarse unknowns, NONE for other candidates, and whether this process owns them (n,).
 
-    The process of lowest rank with a candidate owns the unknown. Owners and numbers are found on processes to which the
-    keys are distributed.
+    The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
     Parameters
     ----------

@@ -78,18 +78,14 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,).
+    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,)."""
 
-    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, m^d, the exchanged
-    fluid volume; start: forces at the start of the step, N; fluid: residual of the storage, or None.
-    """
-
-    u: NDArray[np.float64]
-    p: NDArray[np.float64]
-    forces: NDArray[np.float64]
-    exchanged: NDArray[np.float64]
-    start: NDArray[np.float64]
-    fluid: StorageResidual | None
+    u: NDArray[np.float64]  # relative residual of momentum
+    p: NDArray[np.float64]  # relative residual of storage
+    forces: NDArray[np.float64]  # scale of u, N
+    exchanged: NDArray[np.float64]  # scale of p: exchanged fluid volume, m^d
+    start: NDArray[np.float64]  # forces at the start of the step, N
+    fluid: StorageResidual | None  # residual of the storage, or None
 
     @cached_property
     def each(self) -> NDArray[np.float64]:
@@ -265,21 +261,29 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance."""
+        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance.
+
+        Raise NotConverged after as many updates as Newton's method may take iterations.
+        """
         momentum = self._momentum
+        count = 0
         while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
-            errors = self._errors(errors.start)
+            self._check(count, "newton")
+            errors, count = self._errors(errors.start), count + 1
         return errors
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors at the starting point: a guess with a smaller residual than the present (u, p), if any.
+        """Return the errors at the starting point: a guess that is better than the present (u, p), if any.
 
-        Also return the other starting point, or None.
+        A better guess has less potential energy in elastic bodies, else a smaller residual. Bending has small forces:
+        a good guess of it may have a larger residual than no guess. Also return the other starting point, or
+        None.
         """
         errors, start = self._errors(), self._iterate()
-        guesses = [] if self._linear else self._momentum.guesses()
+        guesses = [] if self._linear or errors.worst <= self._scheme.tolerance else self._momentum.guesses()
+        measure = self._potential() if self._momentum.smooth else lambda errors: errors.u
         at = last = start[0]
-        least = errors.u
+        least = measure(errors)
         for guess in guesses:
             self._go_to([guess, *start[1:]])
             last = None
@@ -287,14 +291,24 @@ class Newton:
                 found = self._errors(errors.start)
             except NotConverged:
                 continue
-            better = found.u < least  # p is the same; its residual is meaningless before any fluid has been exchanged
+            value = measure(found)
+            better = value < least  # p is the same; its residual is meaningless before any fluid has been exchanged
             if better.any():
                 at = guess if better.all() else np.where(better[self._parts], guess, at)
-                least, last = np.minimum(found.u, least), at if better.all() else None
+                least, last = np.minimum(value, least), at if better.all() else None
         if last is not at:
             self._go_to([at, *start[1:]])
             found = self._errors(errors.start)
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
+
+    def _potential(self) -> Callable[[Errors], NDArray[np.float64]]:
+        """Return a function for twice the present potential energy (parts,), J, less that at the present u.
+
+        It is the work of the residuals on the way, by the trapezoidal rule. The errors must be those of the present u.
+        """
+        system = self._momentum.system
+        r, u = system.residual.array_r.copy(), system.step.array_r.copy()
+        return lambda _: system.of_parts.sums((system.residual.array_r + r) * (system.step.array_r - u))
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
@@ -385,8 +399,8 @@ class Newton:
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
-            where, what = ("storage: a source", size) if np.isfinite(r.norm()) else ("momentum: a law or term", norm)
-            raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
+            where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
+            raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
         self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 

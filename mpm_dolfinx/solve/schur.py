@@ -8,8 +8,8 @@ Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solv
 fixed-stress operator. For large bodies GMRES solves for both unknowns together, see `monolithic`.
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, with the same
-digits. A solve takes 0.8 to 1 times as long. It needs a copy of -B^T for each tangent, and fixed-stress iterations
-would still need the blocks.
+digits. A solve takes 0.8 to 1 times as long. But this needs a copy of -B^T for each tangent, and fixed-stress
+iterations would still need the blocks.
 """
 
 from __future__ import annotations
@@ -169,9 +169,9 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement and its preconditioned solver; ValueError for the monolithic multigrid solver."""
+        """The Schur complement and its preconditioned solver; ValueError for monolithic multigrid, which has none."""
         if self._schur is None:
-            raise ValueError("solvers: multigrid solves for displacements and pressures at once, must be factors")
+            raise ValueError("solvers: monolithic multigrid has no Schur complement, must be direct solvers")
         return self._schur, self._solve_s
 
     def linearise(

@@ -34,6 +34,7 @@ from mpm_dolfinx.points.material_points import (
     ACROSS,
     MaterialPoints,
     body_of,
+    cofactor,
     determinant,
     in_plane,
     in_space,
@@ -41,10 +42,10 @@ from mpm_dolfinx.points.material_points import (
 )
 from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
-from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.state import State, Stay, Trend
 
 TAKES_IN = 0.1
-"""Rate of correction of the points' volume defect `owed`, per cell size that corners move in their part of the bodies.
+"""Rate of correction of the points' volume defect `owed`, per cell size of corner motion in their connected part.
 
 The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With 0,
 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress. From 0.2 on,
@@ -79,6 +80,7 @@ class Motion:
         self._materials = materials
         self._momentum = momentum
         self._storage = storage
+        self._trends = storage is None and momentum.elastic and not momentum.linear and momentum.inertia is None
         self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
@@ -111,7 +113,7 @@ class Motion:
         stays
             Whether points that hardly move may keep their pieces.
         carried
-            Function for the points' velocities, of their motion (n,) in cell sizes, 0 without reset: `Mass.carried`.
+            Function of the points' motion (n,), in cell sizes, 0 without reset: their new velocities, `Mass.carried`.
 
         Raises
         ------
@@ -156,7 +158,8 @@ class Motion:
             _check_inside(cut, points, t, report)
         stays = stays and not (self._materials.retentions and callable(state.stage.conditions["gravity"]))
         stay = Stay(cut.points)
-        new = replace(state, t=t, points=points, pieces=carried, stay=stay)
+        trend = self._followed(state, points, t - state.t) if self._trends else None
+        new = replace(state, t=t, points=points, pieces=carried, stay=stay, trend=trend)
         keeps = keeps & stays
         some, others = over_all(grid.comm, np.array([keeps.any(), not keeps.all()], dtype=float)) > 0
         if not others:
@@ -168,6 +171,39 @@ class Motion:
                 kept["pieces"] = replace(new.pieces, of_cell=carried.of_cell, start=carried.start)
             new = replace(new, stay=replace(stay, keeps=keeps), **kept)
         return new, folded
+
+    def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
+        """Return the trend of the points after a step of dt (s)."""
+        d, before = points.x.shape[1], state.trend
+        moved = (points.x - state.points.x)[:, :, None]
+        rates = np.concatenate([moved, (points.F - state.points.F)[:, :d, :d]], axis=2)[:, None] / dt
+        if before is None:
+            return Trend(np.array([dt]), rates)
+        return Trend(np.append(dt, before.lengths[:1]), np.concatenate([rates, before.rates[:, :1]], axis=1))
+
+    def ahead(self, on_grid: OnGrid, state: State, seconds: float) -> NDArray[np.float64]:
+        """Return the displacements (unknowns,), m, a local array, in the next seconds (s), from the trend of the state.
+
+        The change of each domain is affine. A cell takes the mean of its pieces, and a node the mean of its cells, by
+        volumes. From rest, ten load steps of a drained beam take 50 Newton steps and 30 tangents; from here 33 and 13.
+        """
+        cut, points = on_grid.cut, state.points
+        grid, pieces = cut.grid, on_grid.data.pieces
+        d, places = grid.dim, pieces.places
+        F, change = points.F[:, :d, :d], state.trend.over(seconds)
+        slope = change[:, :, 1:] @ cofactor(F).swapaxes(1, 2) / determinant(F)[:, None, None]
+        origin = change[:, :, :1] - slope @ points.x[:, :, None]
+        affine = cut.to_cells(np.concatenate([origin, slope], axis=2).reshape(-1, d * (1 + d)))
+        rows = np.concatenate([pieces.volume[None], pieces.volume * affine.T])
+        volume, *sums = sum_by(places.slots, rows, len(places.filled))
+        of_cells = np.reshape(sums, (d, 1 + d, -1)).transpose(2, 0, 1)
+        x = grid.node_x[grid.cell_nodes[places.filled]]
+        moved = of_cells[:, None, :, 0] + x @ of_cells[:, :, 1:].swapaxes(1, 2)
+        total, nodes = partial(self._momentum.at_nodes, places.filled), self._momentum.active.now.nodes
+        whole, out = total(volume), np.zeros((len(grid.node_x), d))
+        for axis in range(d):
+            out[nodes, axis] = total(moved[:, :, axis]) / np.where(whole > 0, whole, 1.0)
+        return out.ravel()
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t, s, up to a constant.

@@ -27,7 +27,7 @@ from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
-from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets
+from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets, off_middle
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.grid.grid import sum_by
@@ -176,7 +176,6 @@ class OnGrid(Keyed):
         """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
 
         The mass potentials pi (m,), Pa, preserve linear fields; a constant for each point corrects their pressures.
-        water.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -409,11 +408,11 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) keep their pieces, as their part hardly moves; groups are tested together."""
+        """Return which points (n,) keep their pieces: their connected part hardly moves. Groups are tested together."""
         all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
-        if all_of_them or self.cut.grid.copies > 1:
+        part, count = (0, 1) if all_of_them or self.cut.grid.copies > 1 else self.parts
+        if count == 1:
             return np.full(len(points), all_of_them)
-        part, count = self.parts
         return self.cut.valid(points, part, count)[part]
 
     @cached_property
@@ -540,7 +539,7 @@ class Assembled(Keyed):
             self.storage.set_alternation()
             if (form := storage.fluxes.nonorthogonal) is not None:
                 self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
-        self._gradients: Latest[Gradients] = Latest()
+        self._gradients: Latest[Gradients | None] = Latest()
 
     @property
     def solvers(self) -> LinearSolvers:
@@ -599,8 +598,13 @@ class Assembled(Keyed):
 
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
-            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
+            gradients = None if self._off is None else self._gradients(where, fit)
+            off = gradients and (self._off, gradients, sides)
             return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
+
+        def fit() -> Gradients | None:
+            needed = self._off.some or off_middle(sides, grid).any()
+            return Gradients(contents, sides) if needed else None
 
         mixture = ()
         if self._by_pressure is not None:

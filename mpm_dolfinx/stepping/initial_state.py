@@ -53,7 +53,7 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Iterations that are mixed; iterations, PATIENCE, without reduction of the residual by the factor LESS to end.
+"""Number of mixed iterations; the iteration ends after PATIENCE iterations that do not reduce the residual by LESS.
 
 Tests: a wet bank, elastic or frictional, blocks on a rough base, one of them half supported. With 40 and 16 and with 80
 and 24 the remaining forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 up to 6e-3.
@@ -72,8 +72,10 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     first = _stage(scene, conditions, present, later)
     if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
-            f"{next(iter(quiet))}: cannot hold an initial stress, must begin a stage later: first prescribe the side"
+            f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
         )
+    _check_weight(first, None, 0.0)
+    scene.check_followed(first)
     comm, gravity = scene.grid.comm, first.conditions["gravity"]
     warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
     if scene.fluid and scene.materials.conducts:
@@ -118,6 +120,7 @@ def begin_stage(
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
     after = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    _check_weight(after, before, state.t)
     if "gravity" in named or waters(after.given) != waters(before.given):
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
@@ -139,7 +142,7 @@ def begin_stage(
         gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
         what = f"stage: add: body {add[0]}: domains of others have been renewed"
-        raise ValueError(f"{what}, must come before, or without Numerics(renewal=True)")
+        raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
     others = before.data_names(before.named.keys() - after.same(before))
@@ -159,6 +162,7 @@ def begin_stage(
     outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(after, before) else None
     new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    new["trend"] = None if add or remove else state.trend
     return replace(state, points=points, pieces=pieces, **new)
 
 
@@ -204,7 +208,7 @@ def _gripped(
     """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
-        raise ValueError(f"{clashes[0]!r}: points have data of this name, must be another name of a condition")
+        raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
     if before is not None:
         known, at = before.find(points.id)
         for name in kept.keys() & before.data.keys():
@@ -225,11 +229,23 @@ def _holds_as(after: Stage, before: Stage) -> bool:
     )
 
 
+def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
+    """Raise ValueError for quiet sides in a stage whose weight differs from before: their traction does not bear it."""
+    quiet = after.of(Quiet)
+    now = after.gravity_at(t) if quiet else None
+    was = None if before is None else before.gravity_at(t)
+    was = np.zeros(after.free.shape[1]) if was is None else was
+    if now is not None and (now != was).any():
+        what = f"{next(iter(quiet))}: its traction at rest does not bear the weight, gravity = {line(now.tolist())}"
+        allowed = "must begin a stage later: first prescribe the side in a stage without inertia"
+        raise ValueError(f"{what} after {line(was.tolist())}, {allowed}")
+
+
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return the conditions with the scene's contacts, which stages cannot change."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and given != standing:
-        raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
+        raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
     return [*conditions, *(() if given else standing)]
 
 
@@ -259,7 +275,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points with added bodies, and the points of these bodies alone; a body follows the body it lies on."""
+    """Return all points with added bodies, and the points of these bodies alone; a body is placed after its base."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -423,7 +439,8 @@ def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArr
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
-    place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
+    at = start.on_grid.cut, start.on_grid.fill, state.points, data
+    place = Place(*at, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
     when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
     return scene.balance(when, matrices.momentum, data, loads, 0.0)

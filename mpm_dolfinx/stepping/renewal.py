@@ -2,8 +2,7 @@
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
 F of yielded soil is updated by increments, so domains serve for integration only. They may be replaced if the new
-domains fill the same region, keep its surface, and have the same contents. If a domain is longer than a cell, its cells
-are filled anew:
+domains fill the same region, with the same surface and contents. Cells of a domain longer than a cell are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
@@ -294,7 +293,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the points with kept (n,), together with new points."""
+    """Return the points for which kept (n,) is true, together with the new points `made`."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 

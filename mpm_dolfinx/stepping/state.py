@@ -55,6 +55,30 @@ class Stay:
         return Stay(self.points.migrated(exchange), keeps)
 
 
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Motion of the points in the last step or two.
+
+    lengths : (k,)
+        Lengths of the steps, s, the last one first.
+    rates : (n, k, d, 1 + d)
+        Mean rates of x, m/s, and of F, 1/s, in each of them.
+    """
+
+    lengths: NDArray[np.float64]
+    rates: NDArray[np.float64]
+
+    def __post_init__(self):
+        _freeze(vars(self))
+
+    def over(self, seconds: float) -> NDArray[np.float64]:
+        """Return the changes (n, d, 1 + d) of x, m, and F in a time (s), by the parabola through the last states."""
+        rate = self.rates[:, 0]
+        if len(self.lengths) > 1:
+            rate = rate + (seconds + self.lengths[0]) / self.lengths.sum() * (rate - self.rates[:, 1])
+        return seconds * rate
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
     """All data of a scene that one step passes to the next; immutable, as a step returns a new state.
@@ -88,6 +112,9 @@ class State:
     velocity : (unknowns,), m/s
         Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
         or contact. None before the first step, and without yield or contact.
+    trend
+        Motion in the last steps: an initial guess in dry elastic bodies. None before the first step, after a stage that
+        adds or removes bodies, and in other scenes.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
         forces, after a new stage, and after a reset of the grid.
@@ -110,6 +137,7 @@ class State:
     stage: Stage
     begins: bool = True
     velocity: NDArray[np.float64] | None = None
+    trend: Trend | None = None
     held: NDArray[np.float64] | None = None
     rest: NDArray[np.float64] | None = None
     watched: NDArray[np.int64] | None = None
@@ -118,7 +146,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points are at true positions, must count from the grid's base: points.from_base")
+            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property
@@ -154,8 +182,10 @@ class State:
         pieces = self.pieces
         if pieces is not None:
             pieces = pieces.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pieces.id)]))
-        stay = self.stay and self.stay.migrated(exchange)
-        return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay)
+        stay, trend = self.stay and self.stay.migrated(exchange), self.trend
+        if trend is not None:
+            trend = Trend(trend.lengths, exchange.send(trend.rates)[np.argsort(exchange.send(self.points.id))])
+        return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay, trend=trend)
 
     def at_owners(self, grid: Grid) -> State:
         """Return the state with points and pieces on the processes that own their cells."""

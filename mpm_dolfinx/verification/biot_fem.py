@@ -12,8 +12,8 @@ with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(r
 `fluid_content` defines the content zeta and the mass potential pi.  Unsaturated soil has kappa k_r in place of kappa.
 Its content changes by S(p) times the change in saturated soil, plus the change of S, see `retention`.  Saturated pores
 have chi = S = k_r = 1.  If pressures are constant in the cells, the two-point flux is kappa J |F^-T N|^2 (p+ - p-)/h,
-with the distance h of the cells' centres.  This flux is not consistent under shear.  k_r is then the mean for pressures
-between those of the two cells.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
+with the distance h of the cells' centres.  This flux is not consistent under shear.  k_r is then its mean between
+the pressures of the two cells.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
 full circumference.  Materials, retention, user-defined terms and time integration are the code of the material point
 method.  The two methods differ only in discretisation.
 """
@@ -88,19 +88,16 @@ class Space:
 
 
 class Forms(NamedTuple):
-    """Compiled residual, tangent, flux and loads, and their constants.
-
-    dt, since, t: time weight of the flux, time since the start of the step, and time at the end of the substep, s.
-    given: functions of time, each with the constant of its value.
-    """
+    """Compiled residual, tangent, flux and loads, and their constants."""
 
     residual: Any
     tangent: Any
     flux: Any | None
     load: Any | None
-    dt: fem.Constant
-    since: fem.Constant
-    t: fem.Constant
+    dt: fem.Constant  # time weight of the flux, s
+    since: fem.Constant  # time since the start of the step, s
+    t: fem.Constant  # time at the end of the substep, s
+    # functions of time, each with the constant of its value
     given: list[tuple[Callable[[float], ArrayLike], fem.Constant]]
 
 
@@ -167,14 +164,14 @@ class BiotFEM:
         functions("terms", terms)
         functions("sources", sources)
         if fluid is None and (drained or sources):
-            raise ValueError("drained sides and sources need a fluid")
+            raise ValueError("conditions: drained sides or sources without fluid, must be given with fluid")
         if any(outlet.seepage for outlet in drained):
             raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
         fields = (material.porosity, material.biot, material.grain_bulk)
         if material.state or material.unknowns or any(map(callable, fields)):
             raise ValueError(
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
-                "conductivity and parameters of the law may be functions of place, the rest must be numbers"
+                "conductivity and parameters of the law may be functions of position, others must be numbers"
             )
         self.grid = Grid(lower, upper, cells, axisymmetric=axisymmetric)
         self.material, self.fluid = material, fluid
@@ -247,7 +244,7 @@ class BiotFEM:
         plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
         low, high = np.maximum(low, grid.low) - near, np.minimum(high, grid.high) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
-            raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
+            raise ValueError(f"side {name!r}: the region {line(region)} must contain a part of it")
         low[axis], high[axis] = plane - near[axis], plane + near[axis]
         return low, high
 
@@ -576,7 +573,7 @@ class BiotFEM:
         value = load.at(t, self.grid.dim)
         if not value.ndim:
             raise ValueError(
-                f"{line(load)}: value must have {self.grid.dim} components, the reference knows no normals"
+                f"{line(load)}: value must have {self.grid.dim} components, because the reference has no normals"
             )
         return value
 

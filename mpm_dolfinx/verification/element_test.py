@@ -143,7 +143,7 @@ def element_test(
     if wets:
         numbers("strain", ends, (len(ends),), allowed="suctions >= 0 Pa in wetting", test=_not_negative)
         if material.retention is None:
-            raise ValueError(f"{type(material).__name__}: retention = None, must be a law of retention in wetting")
+            raise ValueError(f"{type(material).__name__}: retention = None, must be a retention curve in wetting")
     confinement = float(numbers("confinement", confinement, allowed=">= 0 Pa and finite", test=_not_negative))
     for name, value in (("rate", rate), ("cell_size", cell_size)):
         if value is not None:
@@ -173,12 +173,12 @@ def _not_negative(v) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _At:
-    """State of the sample: F (3, 3), effective Cauchy stress (3, 3), Pa, strain as in `ElementTest`, law's state."""
+    """State of the sample."""
 
-    F: NDArray[np.float64]
-    stress: NDArray[np.float64]
-    strain: float
-    state: dict[str, NDArray[np.float64]]
+    F: NDArray[np.float64]  # (3, 3)
+    stress: NDArray[np.float64]  # effective Cauchy stress (3, 3), Pa
+    strain: float  # as in `ElementTest`
+    state: dict[str, NDArray[np.float64]]  # state variables of the law
 
 
 class _Point:
@@ -288,4 +288,4 @@ class _Point:
             slope = (found[1::2] - found[2::2]).T / (2 * CENTRAL)
             step = np.linalg.lstsq(slope, error, rcond=ROUND_OFF)[0]
             F[rows, columns] -= step
-        raise NotConverged(f"element test: no stretch is found for the prescribed stress at a strain of {strain:g}")
+        raise NotConverged(f"element test: no stretch was found for the prescribed stress at a strain of {strain:g}")
