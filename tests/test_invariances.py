@@ -270,7 +270,7 @@ def ledgers(scenes) -> list[tuple[Scene, Ledger]]:
     for scene in scenes:
         ledger = Ledger()
         try:
-            counted(scene, ledger)
+            counted(scene, ledger, ledger.begun)
         except (ValueError, mpm.NotConverged, mpm.LeftGrid):
             continue
         tell(f"forces off by {ledger.off:.1e}, fluid by {ledger.leaked:.1e}: {scene.line()}")
@@ -310,5 +310,5 @@ def test_soil_that_hardly_changes_its_volume_weighs_what_it_does():
     press = Condition("displacement", "top", (0.0, -0.087), 640.0, "xy")
     scene = Scene(0, (7, 7), (0.32, 0.58), False, (block,), (law,), {}, (press, base), gravity=9.81, end=2100.0)
     ledger = Ledger()
-    counted(scene, ledger)
+    counted(scene, ledger, ledger.begun)
     assert ledger.off < 1e-10, ledger.said

@@ -450,8 +450,11 @@ def run(scene: Scene, frame: Frame) -> list[Shown]:
     return out
 
 
-def counted(scene: Scene, count: Callable[[Built], None]) -> None:
-    """Take the steps of a scene as it is, none of which is cut; call a function before the first and after each."""
+def counted(scene: Scene, count: Callable[[Built], None], begun: Callable[[Built], None]) -> None:
+    """Take the steps of a scene as it is, none of which is cut; call a function before the first and after each.
+
+    begun: called once the scene's stage has begun.
+    """
     built, dt = build(scene, Frame.plain(scene.dim)), scene.end / scene.steps
     count(built)
     for _ in range(scene.steps):
@@ -459,5 +462,6 @@ def counted(scene: Scene, count: Callable[[Built], None]) -> None:
         count(built)
     if scene.stage:
         _stage(built)
+        begun(built)
         built.simulation.step(dt)
         count(built)
