@@ -17,6 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
@@ -126,10 +127,12 @@ class TieLoads(Loads):
         self._cell, self._other = cell, other
         self._values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
+        self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return the matrix B, which maps the unknowns to differences of displacements (m d,), m."""
-        return at_nodes(self._grid, unknowns, self._cell, self._values, self._other)
+        of = self._grid, unknowns, self._cell, self._values, self._other
+        return self._operator((unknowns,), lambda: at_nodes(*of), self._grid.comm)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the penalty forces at u."""
@@ -137,7 +140,7 @@ class TieLoads(Loads):
         w = B.createVecLeft()
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         w.array_w[:] = self._stiffness * (w.array_r + self._gap)
-        B = B if on is at.unknowns else self._B(on)
+        B = B if on is at.unknowns else at_nodes(self._grid, on, self._cell, self._values, self._other)
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
