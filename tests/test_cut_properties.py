@@ -471,7 +471,7 @@ def test_a_face_whose_middle_lies_on_a_plane_within_rounding_has_the_points_of_o
     local = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]])
 
     def points(off):
-        corners = np.array([[[0.7, 0.3, 0.2], [0.75, 0.9, 0.3], [1.25, 0.35, 0.15], [1.3, 0.8, 0.4]]]) + [off, 0, 0]
+        corners = [*np.array([[[0.7, 0.3, 0.2], [0.75, 0.9, 0.3], [1.25, 0.35, 0.15], [1.3, 0.8, 0.4]]]), off, 0, 0]
         _, x, _, share, _ = cut_faces(grid, corners, local)
         x, share = x[share > 1e-8], share[share > 1e-8]
         order = np.lexsort(x.round(6).T)
