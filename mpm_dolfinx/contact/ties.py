@@ -17,6 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
@@ -123,13 +124,14 @@ class TieLoads(Loads):
 
     def __init__(self, grid: Grid, cell, x, other, y, stiffness: NDArray[np.float64], gap: NDArray[np.float64]):
         self._grid = grid
-        self._cell, self._other = cell, other
-        self._values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
+        values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
+        self._difference = lambda unknowns: at_nodes(grid, unknowns, cell, values, other)
+        self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return the matrix B, which maps the unknowns to differences of displacements (m d,), m."""
-        return at_nodes(self._grid, unknowns, self._cell, self._values, self._other)
+        return self._operator((unknowns,), lambda: self._difference(unknowns), self._grid.comm)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the penalty forces at u."""
@@ -137,20 +139,17 @@ class TieLoads(Loads):
         w = B.createVecLeft()
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         w.array_w[:] = self._stiffness * (w.array_r + self._gap)
-        B = B if on is at.unknowns else self._B(on)
+        B = B if on is at.unknowns else self._difference(on)
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a zero matrix with the pattern of `coupling`."""
-        out = self._coupling(unknowns)
+        out = self.coupling(At(unknowns, np.empty(0)))  # it does not depend on the displacement
         out.zeroEntries()
         return out
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return the derivative of the penalty forces."""
-        return self._coupling(at.unknowns)
-
-    def _coupling(self, unknowns: Unknowns) -> PETSc.Mat:
-        B = self._B(unknowns)
+        B = self._B(at.unknowns)
         k = scipy.sparse.diags(self._stiffness, format="csr")
         return petsc_matrix(k, B.getLocalSize()[0], self._grid.comm, own=True).PtAP(B)
