@@ -48,6 +48,13 @@ def _of_hexahedra(
     F is the sum over corners of x_k and dV/dX_k, over V.  Arrays have the points last.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
+    slope = _slopes(X)
+    volume = (X * slope).sum(axis=(0, 1)) / 3
+    return np.moveaxis(np.einsum("kan,kbn->abn", x, slope) / volume, 2, 0).copy(), volume
+
+
+def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives (8, 3, n), m^2, of the volumes of hexahedra by their corners X (8, 3, n), m."""
     slope = np.zeros_like(X)
     for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
         p, q, r, s = X[face]
@@ -57,8 +64,22 @@ def _of_hexahedra(
         area, by_a, by_b = (sign / 24 * cross(*pair) for pair in ((a, b), (b, total), (total, a)))
         for corner, own in zip(face, (-by_a, -by_b, by_b, by_a), strict=True):
             slope[corner] += area + own
-    volume = (X * slope).sum(axis=(0, 1)) / 3
-    return np.moveaxis(np.einsum("kan,kbn->abn", x, slope) / volume, 2, 0).copy(), volume
+    return slope
+
+
+def volume_slopes(
+    corners: NDArray[np.float64], axisymmetric: bool = False
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the volumes (n,) of domains, m^d, and their derivatives (n, 2^d, d) by the corners, m^(d-1).
+
+    In axisymmetry volumes of rings, m^3, and derivatives, m^2, at a constant radius of the centroid.
+    """
+    now = domain_volumes(corners, axisymmetric)
+    if corners.shape[2] == 3:
+        return now, _slopes((corners - corners[:, :1]).transpose(1, 2, 0)).transpose(2, 0, 1)
+    ring = now / volumes(corners) if axisymmetric else np.ones(len(now))
+    across = (corners[:, [1, 3, 0, 2]] - corners[:, [2, 0, 3, 1]])[:, :, ::-1] * [0.5, -0.5]  # the other diagonal
+    return now, across * ring[:, None, None]
 
 
 def cell_ratios(

@@ -94,6 +94,10 @@ class Lattice:
         """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
         return self._held_of(ids)[0]
 
+    def touches(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which corners (m, 2^d) of domains touch other bodies."""
+        return self._held_of(ids)[1]
+
     def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return `given` of domains, and which of their corners (m, 2^d) touch other bodies."""
 
@@ -248,6 +252,15 @@ def given(
         at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.finest[axis]
         for letter in axes:
             out[:, :, "xyz".index(letter)] |= at_wall
+    return out
+
+
+def touching(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.bool_]:
+    """Return which corners (n, 2^d) of seeded domains touch other bodies."""
+    out = np.zeros(points.corners.shape[:2], dtype=bool)
+    for lattice in lattices:
+        rows = lattice.rows(points)
+        out[rows] = lattice.touches(points.id[rows])
     return out
 
 

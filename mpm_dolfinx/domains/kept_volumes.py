@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""Particle domains of yielded soil keep the volumes of their points.
+
+The volume ratio of a point is a mean over its cell, but its corners follow a field that varies in the cell, along
+straight edges.  In elastic soil F and the ratios of cells follow from the corners.  In yielded soil F is incremental,
+so volumes of domains and points would drift apart, and cells would overfill.  After a step the corners of yielded
+domains therefore move by the smallest d with
+
+    sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2  ->  min,
+
+with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
+held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
+projection); volumes of domains need no second cut.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import lsmr
+
+from mpm_dolfinx.base.tolerances import NEAR, SAME
+from mpm_dolfinx.domains.domain_gradient import volume_slopes
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import to_root
+
+SOFT = 0.1
+"""Weight of the motion.  Alternating volumes of a regular lattice do not change with its corners, to first order."""
+
+
+def with_volumes(
+    grid: Grid,
+    ids: NDArray[np.int64],
+    corners: NDArray[np.float64],
+    volume: NDArray[np.float64],
+    yielded: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the corners (n, 2^d, d), m, after the correction; one process computes it.
+
+    Parameters
+    ----------
+    ids : (n,)
+        Numbers of the points.
+    corners : (n, 2^d, d), m
+        Corners of the domains; none leaves the grid by the correction.
+    volume : (n,), m^d
+        Volumes of the points, > 0; in axisymmetry volumes of their rings, m^3.
+    yielded : (n,)
+        Domains to correct.
+    free : (n, 2^d, d)
+        Components of corners that may move.
+    """
+    root = to_root(grid.comm, len(ids))
+    rows = [root.send(values) for values in (ids, corners, volume, yielded, free & yielded[:, None, None])]
+    motion = np.zeros_like(rows[1])
+    if grid.comm.rank == 0:
+        order = rows[0].argsort()  # sums do not depend on the processes
+        motion[order] = _motion(grid, *(values[order] for values in rows))
+    inside = (corners >= grid.low) & (corners <= grid.high)
+    moved = corners + root.back(motion)
+    return np.where(inside, np.clip(moved, grid.low, grid.high), moved)
+
+
+def _motion(
+    grid: Grid,
+    ids: NDArray[np.int64],
+    corners: NDArray[np.float64],
+    volume: NDArray[np.float64],
+    yielded: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the motion (n, 2^d, d), m, of the corners of all domains."""
+    d = grid.dim
+    number = _numbers(ids * 0 + grid.copy(ids), corners, NEAR * grid.least)
+    count = int(number.max(initial=-1)) + 1
+    held = np.stack([np.bincount(number.ravel(), ~free[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
+    now, slope = volume_slopes(corners[yielded], grid.axisymmetric)
+    size = np.linalg.norm(slope, axis=(1, 2))
+    at = number[yielded]
+    columns = at[:, :, None] * d + np.arange(d)
+    values = slope / size[:, None, None] * ~held[at]
+    starts = np.arange(len(at) + 1) * columns[:1].size
+    A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
+    missing = (volume[yielded] - now) / size
+    return lsmr(A, missing, damp=SOFT, atol=SAME**1.25, btol=SAME**1.25)[0].reshape(-1, d)[number]
+
+
+def _numbers(group: NDArray[np.int64], x: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+    """Return the numbers (n, 2^d) of corners x (n, 2^d, d), m; one for corners of a group (n,) within `tolerance`, m."""
+    keys = [np.unique(group, return_inverse=True)[1].ravel().repeat(x.shape[1])]
+    for column in x.reshape(-1, x.shape[2]).T:
+        order = column.argsort()
+        key = np.zeros(len(column), dtype=np.int64)
+        key[order[1:]] = np.cumsum(np.diff(column[order]) > tolerance)
+        keys.append(key)
+    key = np.ravel_multi_index(keys, [int(key.max(initial=0)) + 1 for key in keys])
+    return np.unique(key, return_inverse=True)[1].reshape(x.shape[:2])
