@@ -26,7 +26,10 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
-"""Weight of the motion.  Alternating volumes of a regular lattice do not change with its corners, to first order."""
+"""Weight of the motion.  Alternating volumes of a regular lattice do not change with its corners, to first order.
+
+Plateau (flow): halved 1.3e-04, doubled 3.2e-04, cells 9.2e-02 (relative changes of the result).
+"""
 
 
 def with_volumes(
@@ -44,7 +47,7 @@ def with_volumes(
     ids : (n,)
         Numbers of the points.
     corners : (n, 2^d, d), m
-        Corners of the domains; none leaves the grid by the correction.
+        Corners of the domains.
     volume : (n,), m^d
         Volumes of the points, > 0; in axisymmetry volumes of their rings, m^3.
     yielded : (n,)
@@ -58,9 +61,7 @@ def with_volumes(
     if grid.comm.rank == 0:
         order = rows[0].argsort()  # sums do not depend on the processes
         motion[order] = _motion(grid, *(values[order] for values in rows))
-    inside = (corners >= grid.low) & (corners <= grid.high)
-    moved = corners + root.back(motion)
-    return np.where(inside, np.clip(moved, grid.low, grid.high), moved)
+    return corners + root.back(motion)
 
 
 def _motion(
@@ -73,7 +74,7 @@ def _motion(
 ) -> NDArray[np.float64]:
     """Return the motion (n, 2^d, d), m, of the corners of all domains."""
     d = grid.dim
-    number = _numbers(ids * 0 + grid.copy(ids), corners, NEAR * grid.least)
+    number = _numbers(np.broadcast_to(grid.copy(ids), ids.shape), corners, NEAR * grid.least)
     count = int(number.max(initial=-1)) + 1
     held = np.stack([np.bincount(number.ravel(), ~free[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(corners[yielded], grid.axisymmetric)
@@ -84,11 +85,11 @@ def _motion(
     starts = np.arange(len(at) + 1) * columns[:1].size
     A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
     missing = (volume[yielded] - now) / size
-    return lsmr(A, missing, damp=SOFT, atol=SAME**1.25, btol=SAME**1.25)[0].reshape(-1, d)[number]
+    return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
 
 
 def _numbers(group: NDArray[np.int64], x: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
-    """Return the numbers (n, 2^d) of corners x (n, 2^d, d), m; one for corners of a group (n,) within `tolerance`, m."""
+    """Return numbers (n, 2^d) of corners x (n, 2^d, d), m; corners of a group (n,) within `tolerance`, m, share one."""
     keys = [np.unique(group, return_inverse=True)[1].ravel().repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:
         order = column.argsort()

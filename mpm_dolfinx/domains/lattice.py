@@ -255,6 +255,18 @@ def given(
     return out
 
 
+def stopped(
+    grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return corners (n, 2^d, d), m, that pass no wall, and leave the grid only if they did `before` a correction."""
+    shut = np.zeros((2, grid.dim), dtype=bool)
+    for name, axes in walls.items():
+        axis, end = SIDES[grid.dim][name]
+        shut[end, axis] = "xyz"[axis] in axes
+    corners = np.where(shut[0] | (before >= grid.low), np.maximum(corners, grid.low), corners)
+    return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
+
+
 def touching(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.bool_]:
     """Return which corners (n, 2^d) of seeded domains touch other bodies."""
     out = np.zeros(points.corners.shape[:2], dtype=bool)

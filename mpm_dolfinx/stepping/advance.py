@@ -21,7 +21,7 @@ from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
 from mpm_dolfinx.domains.kept_volumes import with_volumes
-from mpm_dolfinx.domains.lattice import filtered, given, touching
+from mpm_dolfinx.domains.lattice import filtered, given, stopped, touching
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.forms.point_forms import PointData
@@ -309,9 +309,11 @@ class Motion:
         held = touching(stage.lattices, points)
         for one in loads:
             held |= one.near(state.points, points.corners)
-        own = ~given(grid, stage.lattices, stage.conditions["walls"], points)
+        walls = stage.conditions["walls"]
+        own = ~given(grid, stage.lattices, walls, points)
         volume = points.volume0 * points.J
         corners = with_volumes(grid, points.id, points.corners, volume, yielded, own & ~held[:, :, None])
+        corners[yielded] = stopped(grid, walls, corners[yielded], points.corners[yielded])
         for one in loads:
             corners = one.outside(corners, own)
         return replace(points, corners=corners, x=centroids(corners))
