@@ -80,9 +80,11 @@ def test_shared_corners_move_together_and_held_ones_stay(dim):
     free = np.ones(corners.shape, dtype=bool)
     free[:, :, 0] = False
     yielded = ids > 0
-    moved = with_volumes(grid, ids, corners, volume, yielded, free)
-    motion = moved - corners
     number = body.nodes(ids)
+    domains = ids, corners, volume, yielded, free, 0 * ids
+    moved = with_volumes(grid, *domains, number)
+    assert with_volumes(grid, *domains, 0 * number - 1) == pytest.approx(moved, abs=1e-12)  # as if renewed
+    motion = moved - corners
     for k in np.unique(number):
         assert np.ptp(motion[number == k], axis=0).max() < 1e-12
     assert np.abs(motion[:, :, 0]).max() == np.abs(motion[0]).max() == 0

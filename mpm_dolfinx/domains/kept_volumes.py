@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import lsmr
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
@@ -39,6 +40,8 @@ def with_volumes(
     volume: NDArray[np.float64],
     yielded: NDArray[np.bool_],
     free: NDArray[np.bool_],
+    body: NDArray[np.int64],
+    number: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """Return the corners (n, 2^d, d), m, after the correction; one process computes it.
 
@@ -54,27 +57,31 @@ def with_volumes(
         Domains to correct.
     free : (n, 2^d, d)
         Components of corners that may move.
+    body, number : (n,), (n, 2^d)
+        Bodies, and numbers of the corners as seeded, >= 0; -1 for renewed domains.
     """
     root = to_root(grid.comm, len(ids))
-    rows = [root.send(values) for values in (ids, corners, volume, yielded, free & yielded[:, None, None])]
+    columns = (ids, corners, volume, yielded, free & yielded[:, None, None], body, number)
+    rows = [root.send(values) for values in columns]
     motion = np.zeros_like(rows[1])
     if grid.comm.rank == 0:
         order = rows[0].argsort()  # sums do not depend on the processes
-        motion[order] = _motion(grid, *(values[order] for values in rows))
+        motion[order] = _motion(grid, *(values[order] for values in rows[1:]))
     return corners + root.back(motion)
 
 
 def _motion(
     grid: Grid,
-    ids: NDArray[np.int64],
     corners: NDArray[np.float64],
     volume: NDArray[np.float64],
     yielded: NDArray[np.bool_],
     free: NDArray[np.bool_],
+    body: NDArray[np.int64],
+    number: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """Return the motion (n, 2^d, d), m, of the corners of all domains."""
     d = grid.dim
-    number = _numbers(np.broadcast_to(grid.copy(ids), ids.shape), corners, NEAR * grid.least)
+    number = _shared(body, number, corners, NEAR * grid.least)
     count = int(number.max(initial=-1)) + 1
     held = np.stack([np.bincount(number.ravel(), ~free[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(corners[yielded], grid.axisymmetric)
@@ -88,13 +95,25 @@ def _motion(
     return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
 
 
-def _numbers(group: NDArray[np.int64], x: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
-    """Return numbers (n, 2^d) of corners x (n, 2^d, d), m; corners of a group (n,) within `tolerance`, m, share one."""
-    keys = [np.unique(group, return_inverse=True)[1].ravel().repeat(x.shape[1])]
+def _shared(
+    body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
+) -> NDArray[np.int64]:
+    """Return numbers (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,); those that are one corner share one.
+
+    They have one seeded number (n, 2^d), or they are within `tolerance`, m.
+    """
+    keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:
         order = column.argsort()
         key = np.zeros(len(column), dtype=np.int64)
         key[order[1:]] = np.cumsum(np.diff(column[order]) > tolerance)
         keys.append(key)
-    key = np.ravel_multi_index(keys, [int(key.max(initial=0)) + 1 for key in keys])
-    return np.unique(key, return_inverse=True)[1].reshape(x.shape[:2])
+    seeded = number.ravel() >= 0
+    place, node = (
+        np.unique(np.ravel_multi_index(keys, [int(key.max(initial=0)) + 1 for key in keys]), return_inverse=True)[1]
+        for keys in (keys, [keys[0][seeded], number.ravel()[seeded]])
+    )
+    count = int(place.max(initial=0)) + 1
+    total = count + int(node.max(initial=0)) + 1
+    links = coo_matrix((np.ones(len(node)), (place.ravel()[seeded], count + node.ravel())), shape=(total, total))
+    return connected_components(links, directed=False)[1].astype(np.int64)[place].reshape(number.shape)
