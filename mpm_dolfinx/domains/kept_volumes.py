@@ -81,7 +81,7 @@ def _motion(
 ) -> NDArray[np.float64]:
     """Return the motion (n, 2^d, d), m, of the corners of all domains."""
     d = grid.dim
-    number = _shared(body, number, corners, NEAR * grid.least)
+    number = _joined(body, number, corners, NEAR * grid.least)
     count = int(number.max(initial=-1)) + 1
     held = np.stack([np.bincount(number.ravel(), ~free[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(corners[yielded], grid.axisymmetric)
@@ -95,7 +95,7 @@ def _motion(
     return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
 
 
-def _shared(
+def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
     """Return numbers (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,); those that are one corner share one.

@@ -57,8 +57,6 @@ class Lattice:
         Faces of a side, and the components that a condition prescribes there.
     contacts : (rows, corners)
         Domains (m,) in contact with other bodies, and their corners (m, 4) in contact.
-    surface : (rows, corners)
-        Domains (m,) at the surface, and their corners (m, 4) there.
     """
 
     def __init__(
@@ -67,7 +65,6 @@ class Lattice:
         start: int,
         given: Iterable[tuple[Surface, Iterable[int]]],
         contacts: tuple[NDArray[np.int64], NDArray[np.int64]],
-        surface: tuple[NDArray[np.int64], NDArray[np.int64]],
     ):
         self._body = body
         self._start = start
@@ -79,9 +76,7 @@ class Lattice:
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._tolerance = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
         # numbers of held corners: flags of all corners would be as large as the body, on every process
-        self._contacts, self._surface = (
-            np.unique(np.take_along_axis(body.nodes(rows), corners, axis=1)) for rows, corners in (contacts, surface)
-        )
+        self._contacts = np.unique(np.take_along_axis(body.nodes(contacts[0]), contacts[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
             own = (faces.id >= self._start) & (faces.id < self._stop)
@@ -99,20 +94,20 @@ class Lattice:
         """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
         return self._held_of(ids)[0]
 
-    def touches(self, ids: NDArray[np.int64], beside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which corners (m, 2^d) of domains touch other bodies, see `touching`."""
-        return self._held_of(ids)[1] | among(self.nodes(ids), self._surface) & beside[:, None]
+    def corners_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the numbers (m, 2^d) of corners of domains, and which of these corners touch other bodies."""
+        return self._nodes(ids), self._held_of(ids)[1]
 
     def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return `given` of domains, and which of their corners (m, 2^d) touch other bodies."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-            number = self.nodes(ids)
+            number = self._nodes(ids)
             return np.stack([among(number, of_axis) for of_axis in self._given], axis=2), among(number, self._contacts)
 
         return self._held(ids, held)
 
-    def nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers (m, 2^d) of the corners of domains."""
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
@@ -125,7 +120,7 @@ class Lattice:
         """
         if self._count is None:
             return np.zeros_like(d)
-        number = self.nodes(ids)
+        number = self._nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         shape = tuple(np.add(self._count, 1))
         change = _change(comm, shape, number.ravel(), values, self._tolerance, self._thirds).reshape(d.shape)
@@ -240,8 +235,7 @@ def lattices(
     for i, own in around.items():
         touching = [covers(own, other).face for j, other in around.items() if j != i]
         contacts = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *touching]))
-        parts = ((own.row[faces], own.index[faces]) for faces in (contacts, slice(None)))
-        out.append(Lattice(bodies[i], int(start[i]), given, *parts))
+        out.append(Lattice(bodies[i], int(start[i]), given, (own.row[contacts], own.index[contacts])))
     return out
 
 
@@ -261,15 +255,6 @@ def given(
     return out
 
 
-def numbers(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.int64]:
-    """Return the numbers (n, 2^d) of the corners of seeded domains in their bodies; -1 for renewed domains."""
-    out = np.full(points.corners.shape[:2], -1)
-    for lattice in lattices:
-        rows = lattice.rows(points)
-        out[rows] = lattice.nodes(points.id[rows])
-    return out
-
-
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -282,16 +267,13 @@ def stopped(
     return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
 
 
-def touching(lattices: Sequence[Lattice], points: MaterialPoints, beside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which corners (n, 2^d) of seeded domains touch other bodies: since the start, or as part of the surface.
-
-    beside (n,): which domains share nodes with other bodies.
-    """
-    out = np.zeros(points.corners.shape[:2], dtype=bool)
+def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the numbers (n, 2^d) of corners in their bodies, -1 for renewed domains, and which touch other bodies."""
+    numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
-        out[rows] = lattice.touches(points.id[rows], beside[rows])
-    return out
+        numbers[rows], touching[rows] = lattice.corners_of(points.id[rows])
+    return numbers, touching
 
 
 def filtered(
