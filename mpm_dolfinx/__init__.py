@@ -5,12 +5,12 @@ A `Simulation` contains a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`,
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`,
 `BarcelonaBasic`, or a user-defined `Skeleton`.  It has a `Fluid`, and conditions on the sides of the bodies:
 `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`.  A rigid `Tool` has the shape
-`HalfSpace`, `Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  Results go to a `Writer`,
-whose files `one_file` joins, and to a `Checkpoint` for `resume`.  `stage` changes the scene between two runs.
-`factor_of_safety` reduces the strength to failure.  Terms in UFL: see `mpm_dolfinx.materials.user_functions`.
+`HalfSpace`, `Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  A `Writer` writes results
+to files, which `one_file` joins; `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two
+runs.  `factor_of_safety` reduces the strength until failure.  Terms in UFL: `mpm_dolfinx.materials.user_functions`.
 
-Units are SI, or any consistent ones (`Fluid`).  Stress is positive in tension, pore pressure in compression.  2D is
-plane strain, with forces of a slice of 1 m, or axisymmetric (`Grid`), with forces of the whole revolution.
+Units are SI, or any consistent ones (`Fluid`).  Stress is positive in tension, pore pressure in compression.  In plane
+strain, forces act on a slice of 1 m.  In axisymmetry (`Grid`), forces act on the full circumference.
 """
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it reports missing dependencies

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Versions and solvers that a report of a bug should name, laboratory tests of soil laws, and files of a run as one."""
+"""Print versions and solvers for a bug report, run laboratory tests of soil laws, join the output files of a run."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _version(package: str) -> str:
 
 
 def number(name: str, text: str) -> float | list[float]:
-    """Return the number, or the several with commas between them, that a text says."""
+    """Return the number in a text, or several numbers separated by commas as a list."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -56,14 +56,14 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return a law of the package by its name, or by file.py:name one of a user's."""
+    """Return a law: of the package by its name, or of a user by file.py:name."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)
     elif not Path(file).is_file():
         raise ValueError(f"law = {name!r}: there is no file {file}")
     else:
-        sys.path.insert(0, str(Path(file).parent))  # as a script finds what lies beside it
+        sys.path.insert(0, str(Path(file).parent))  # so that the file can import modules in its own folder
         found = runpy.run_path(file).get(own)
     if _is_law(found):
         return found
@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants of a law from texts name=value; each must be known, and given once."""
+    """Return the constants of a law from texts name=value; each name must be one of the law's, and given once."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")
@@ -92,7 +92,7 @@ def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[
 
 
 def run_element_test(o: argparse.Namespace) -> None:
-    """Drive a law through a laboratory test, print a table of it and draw it."""
+    """Compute a laboratory test of a law, print a table of the results and draw them."""
     if o.draw and not Path(o.draw).parent.is_dir():
         raise ValueError(f"--draw {o.draw}: there is no folder {Path(o.draw).parent}")
     law, strain = law_of(o.law), number("strain", o.strain)
@@ -111,19 +111,19 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m mpm_dolfinx", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("info", help="print versions and solvers")
-    lab = commands.add_parser("element-test", help="drive a soil law through a laboratory test")
+    lab = commands.add_parser("element-test", help="compute a laboratory test of a soil law")
     lab.add_argument("law", help="name of the law, such as ModifiedCamClay, or file.py:name")
     lab.add_argument("test", help=", ".join(mpm_dolfinx.ElementTest.KINDS))
-    lab.add_argument("strain", help="axial strain, compression positive, or shear; turning points with commas")
-    lab.add_argument("constants", nargs="*", metavar="name=value", help="of the law; vectors with commas")
-    lab.add_argument("--steps", type=int, default=100, help="to each turning point (100)")
-    lab.add_argument("--confinement", type=float, default=0.0, help="isotropic effective stress before, Pa (0)")
-    lab.add_argument("--suction", type=float, default=0.0, help="of the soil at the start, Pa (0)")
-    lab.add_argument("--rate", type=float, help="strain in a second, of laws that depend on it, 1/s")
-    lab.add_argument("--cell-size", type=float, help="size of cells, of laws that soften, m")
-    lab.add_argument("--draw", help="file of a picture")
-    one = commands.add_parser("one-file", help="write the points of a run as one file of ParaView's, points.xdmf")
-    one.add_argument("folder", help="that of the Writer")
+    lab.add_argument("strain", help="axial strain, compression positive, or shear; commas between turning points")
+    lab.add_argument("constants", nargs="*", metavar="name=value", help="constant of the law; commas in vectors")
+    lab.add_argument("--steps", type=int, default=100, help="number of steps to each turning point (100)")
+    lab.add_argument("--confinement", type=float, default=0.0, help="initial isotropic effective stress, Pa (0)")
+    lab.add_argument("--suction", type=float, default=0.0, help="initial suction, Pa (0)")
+    lab.add_argument("--rate", type=float, help="strain rate, 1/s, for rate-dependent laws")
+    lab.add_argument("--cell-size", type=float, help="cell size, m, for laws that soften")
+    lab.add_argument("--draw", help="image file for the results")
+    one = commands.add_parser("one-file", help="write the points of a run to one file for ParaView, points.xdmf")
+    one.add_argument("folder", help="folder of the Writer")
     o = parser.parse_args(argv)
     if MPI.COMM_WORLD.rank > 0:
         return

@@ -5,9 +5,9 @@ A number is *structure* where it cannot be another one: see `structure` below. I
 or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    Plateau (scene): halved a, doubled b, cells c.
+    Sensitivity (name scene): half the value changes the result by a, twice by b, finer cells by c.
 
-The latter are relative changes of the scene's answers: with half and twice the number, and with finer cells. One of the
+The latter are relative changes of the scene's results: with half and twice the number, and with finer cells. One of the
 first two is not zero, so the number affects the scene; both are below the third. `python tests/plateaus.py` measures
 them again. All other numbers are *ad hoc*.
 """
@@ -24,7 +24,10 @@ SOURCE = re.compile(
     r"\bSource: .*?(\b(1[89]|20)\d\d\b|\beq\. |\bequation\b|\bdefinition\b|\bformat\b|\bexact\b|\bepsilon\b|\bIEEE\b)",
     re.DOTALL,
 )
-PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-]+), cells ([\d.e+-]*[\d])")
+PLATEAU = re.compile(
+    r"\bSensitivity \((\w+) scene\): half the value changes the result by ([\d.e+-]+), "
+    r"twice by ([\d.e+-]+), finer cells by ([\d.e+-]*[\d])"
+)
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""
 STYLES = ("figsize", "alpha", "dpi", "bounds")

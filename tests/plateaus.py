@@ -147,8 +147,9 @@ def main(arguments: list[str]) -> None:
         where, _, name = number.rpartition(":")
         began = time.time()
         found = moved(where, name, scene)
-        told = ", ".join(f"{k} {v:.1e}" for k, v in zip(("halved", "doubled", "cells"), found, strict=True))
-        print(f"{number} Plateau ({scene}): {told}.  {time.time() - began:.0f} s", flush=True)
+        half, twice, cells = (f"{value:.1e}" for value in found)
+        told = f"half the value changes the result by {half}, twice by {twice}, finer cells by {cells}."
+        print(f"{number} Sensitivity ({scene} scene): {told}  {time.time() - began:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

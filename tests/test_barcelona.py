@@ -362,7 +362,7 @@ def test_it_needs_a_law_of_retention_and_suctions_that_are_none():
     dry = replace(SOIL, retention=None)
     with pytest.raises(ValueError, match="BarcelonaBasic: retention = None, must be a retention curve"):
         narrow(dry, 2, 0.0)
-    with pytest.raises(ValueError, match="BarcelonaBasic: retention = None, must be a law of retention in wetting"):
+    with pytest.raises(ValueError, match="BarcelonaBasic: retention = None, must be a retention curve in wetting"):
         element_test(dry, "wetting isotropic", 0.0, suction=S0)
     with pytest.raises(ValueError, match=r"suction = -1\.0, must be >= 0 Pa"):
         element_test(SOIL, "isotropic", 0.1, suction=-1.0)

@@ -285,7 +285,7 @@ def test_what_are_no_contacts_is_refused():
     s = mpm.Simulation(
         grid, boxes[:2], [sand], walls={"bottom": "xy"}, conditions=[mpm.Contact(0, 1)], gravity=[0, -10]
     )
-    with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
+    with pytest.raises(ValueError, match=r"factor_of_safety: the scene has contacts, must have none"):
         mpm.factor_of_safety(s)
 
 
@@ -324,8 +324,8 @@ def test_a_block_slides_off_the_edge_of_another():
     forces, deepest = [], []
 
     def see(s):
-        contacts, cut = s.state.stage.acting[-1].found, s.scene.last[0].cut
-        deepest.append(-min(pairs.gap.min(initial=0.0) for _, pairs in contacts._met_all(cut, s.points)))
+        contacts, cut = s.state.stage.acting[-1], s.scene.last[0].cut
+        deepest.append(-min(pairs.gap.min(initial=0.0) for _, pairs in contacts._opposite_all(cut, s.points)))
         forces.append(s.tool_forces.array[0, :2])
 
     s.run(9.0, 0.5, observe=see)

@@ -277,6 +277,45 @@ def test_tools_that_are_neither_free_nor_given_are_refused(options, said):
         mpm.Tool(mpm.Ball((0, 0), 1.0), **options)
 
 
+def dropped(gap, stress=None, **options):
+    """Return a disc that falls on a layer of soil."""
+    grid = mpm.Grid([0, 0], [2, 2], [8, 8])
+    disc = mpm.Tool(mpm.Ball((1, 1.5 + gap), 0.5), **options)
+    scene = {"walls": {"left": "x", "right": "x", "bottom": "xy"}, "conditions": [disc], "initial_stress": stress}
+    return mpm.Simulation(grid, [mpm.box(grid, (0, 0), (2, 1))], [STIFF], gravity=(0, -G), inertia=True, **scene)
+
+
+def test_a_smooth_disc_bounces_without_spin():
+    """Its moment is the difference of forces times the radius, and so consists of rounding errors alone."""
+    s = dropped(0.02, mass=10.0, velocity=(0, -1))
+    assert not s.run(0.08, 0.01, progress=False).cuts
+    assert s.outcome("tool_velocity")["tool"][1] > 0.1 and abs(s.outcome("tool_spin")["tool"]) < 1e-10
+
+
+def test_a_disc_almost_without_moment_of_inertia_leaves_as_it_rolls():
+    s = dropped(0.02, mass=100.0, moment=1e-4, friction=0.3, velocity=(1, -1))
+    assert not s.run(0.05, 0.01, progress=False).cuts
+    speed = s.outcome("tool_velocity")["tool"]
+    assert speed[1] > 0.1 and s.outcome("tool_spin")["tool"] * 0.5 == pytest.approx(-speed[0], rel=0.2)
+
+
+@pytest.mark.parametrize("gap", [0.1, 0.0])
+def test_a_disc_falls_on_ground_with_an_initial_stress(gap):
+    """The stress is balanced with the tool at rest; the disc sinks under its weight only afterwards."""
+    s = dropped(gap, mpm.K0(0.4), mass=100.0)
+    s.run(0.05, 0.025, progress=False)
+    fallen, free = s.tool_travel["tool"][1], -G * 0.05**2 / 2
+    assert fallen == pytest.approx(free) if gap else 0.1 < fallen / free < 0.5
+    assert np.isfinite(s.tangent(0.01).stiffness.data).all()
+
+
+def test_contact_that_never_settles_fails_the_step(monkeypatch):
+    s = dropped(0.01, mass=10.0, velocity=(0, -1))
+    monkeypatch.setattr("mpm_dolfinx.contact.free_tools.FreeTools.augment", lambda self, at: True)
+    with pytest.raises(mpm.NotConverged, match="no convergence in 25 iterations"):
+        s.step(0.02)
+
+
 def test_free_tools_are_refused_without_inertia():
     with pytest.raises(ValueError, match="inertia=True"):
         sledge(inertia=False)

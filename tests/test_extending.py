@@ -369,7 +369,7 @@ class Fibres(mpm.NeoHookean):
 CASES = {
     "sum over two sizes": (lambda: column(fluid=False, material=Fibres(1, 1)), "Fibres.*must be"),
     "no law": (lambda: column(fluid=False, material=NoLaw(1, 1)), "NoLaw: has neither, must define energy or"),
-    "unknown parameter": (lambda: column(fluid=False, material=Unknown(1, 1)), "law takes 'stiffness', must be F or"),
+    "unknown parameter": (lambda: column(fluid=False, material=Unknown(1, 1)), "'stiffness' of its functions, must"),
     "reserved name": (lambda: column(fluid=False, material=Taken(1, 1)), "the name 'weight' is taken"),
     "field of the wrong shape": (
         lambda: column(fluid=False, material=replace(SOFT, bulk=lambda X: X.mean())),
@@ -381,7 +381,7 @@ CASES = {
     ),
     "update of another shape": (
         lambda: column(fluid=False, material=WrongUpdate(1, 1)).step(1.0),
-        r"WrongUpdate.update: gives \{'damage': \(2, 2\)\}, must have",
+        r"WrongUpdate.update: returns \{'damage': \(2, 2\)\}, must have",
     ),
     "unknown argument of a term": (
         lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be some of points, u, v, t, dt"),

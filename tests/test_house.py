@@ -5,18 +5,20 @@ import house
 import pytest
 
 CEILINGS = {
-    "ad hoc named numbers": 105,
+    "ad hoc named numbers": 100,
     "rules among numbers in functions": 3,
-    "imports a file, mean": 5.69,
+    "imports a file, mean": 5.61,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 14,
-    "assignments of three and more values": 20,
-    "changes of hidden state": 9,
+    "assignments of three and more values": 19,
+    "changes of hidden state": 6,
     "files that name a condition's class, most": 6,
-    "lines of the package": 37220,
+    "lines of the package": 36930,
 }
+
+HALF = "half the value changes the result by"
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +41,8 @@ def test_every_measure_has_a_ceiling(measures):
         ("Half of a cell.", False),
         ("Source: it works well", False),
         ("Source: Higham (2002), eq. 3.4.", True),
-        ("Plateau (bank): halved 1e-5, doubled 2e-5, cells 3e-3.", True),
-        ("Plateau (bank): halved 1e-5, doubled 4e-3, cells 3e-3.", False),
+        (f"Sensitivity (bank scene): {HALF} 1e-5, twice by 2e-5, finer cells by 3e-3.", True),
+        (f"Sensitivity (bank scene): {HALF} 1e-5, twice by 4e-3, finer cells by 3e-3.", False),
     ],
 )
 def test_number_has_a_source_or_moves_less_than_the_cells(said, holds):

@@ -324,7 +324,7 @@ def test_a_resumed_flight_has_the_same_bits(tmp_path):
     ("options", "names"),
     [
         ({"velocity": (1, 0)}, "velocity"),
-        ({"inertia": False, "velocity": (1, 0)}, "at rest at first"),
+        ({"inertia": False, "velocity": (1, 0)}, "no inertia at first"),
         ({"inertia": 1}, "inertia"),
         ({"inertia": True, "velocity": (1, 0, 0)}, "velocity"),
         ({"inertia": True, "velocity": lambda X: X}, "velocity"),

@@ -224,6 +224,18 @@ def test_corners_do_not_bend_towards_a_body_beyond_an_empty_cell():
     assert max(differences(scene, run(scene, Frame.plain(2)), run(scene, beside)).values()) < ASKED
 
 
+def test_a_side_that_drains_a_part_of_a_cell_does_not_see_how_others_lie():
+    """Its flow was corrected for its offset only where some cells lay off each other, be it far away."""
+    law = {"bulk": 4e9, "shear": 2e9, "porosity": 0.4, "conductivity": 1e-7}
+    block, walls = Block((0.0, 0.0), (2.0, 1.3), 0), {"bottom": "y", "left": "x", "right": "x"}
+    part = ((-1.0, -1.0), (1.15, 5.0))
+    press, drain = Condition("traction", "top", (0.0, -1e4), 20.0), Condition("drained", "top", (0.0,), region=part)
+    scene = Scene(0, (4, 4), (0.5, 0.5), False, (block,), (("Hencky", law),), walls, (press, drain), fluid=2.2e9)
+    scene = scene.with_(end=40.0, steps=8)
+    base = run(scene, Frame.plain(2))
+    assert max(differences(scene, base, run(scene, replace(Frame.plain(2), far="moving"))).values()) < ASKED
+
+
 def test_tangents_of_soil_that_yields_are_as_firm_in_any_unit_of_length():
     """Axisymmetric: what was added to them lacked the way around, and steps were cut, or given up, in small lengths."""
     law = {"bulk": 4e7, "shear": 2.4e6, "cohesion": 4.9e3, "friction": 33.0, "dilation": 33.0, "grain_density": 2600.0}

@@ -106,6 +106,36 @@ def test_a_seam_at_an_open_end_resists_as_exact(offset):
     assert steady(s) == pytest.approx(TINY * H / resistance(0.1 - offset * H), rel=1e-8, abs=0)
 
 
+def test_a_rounding_of_places_changes_no_flow_where_points_of_two_layers_do_not_match():
+    """A line through the middle of three points lay on the border of two: places 1e-9 cells off changed 5e-5."""
+
+    def flow(off):
+        grid = mpm.Grid([0, 0], [2 * H, 1.2], [2, 12])
+        layers = [(0, 0.13, 2), (0.13, 0.37, 3), (0.37, 1, 2)]
+        bodies = [
+            mpm.mapped(
+                grid,
+                mpm.box(grid, [0, low], [2 * H, high], per_cell=per_cell, material=per_cell - 2),
+                lambda x: x + off * H * np.sin(np.pi * x[:, :1] / H) * np.cos(1e3 * x[:, 1:]) * [1, 0],
+            )
+            for low, high, per_cell in layers
+        ]
+        s = mpm.Simulation(
+            grid,
+            bodies,
+            [SAND, CLAY],
+            fluid=INCOMPRESSIBLE,
+            walls={"left": "x", "right": "x"},
+            conditions=[
+                mpm.Displacement("bottom", (0, 0)),
+                *ends(2),
+            ],
+        )
+        return steady(s)
+
+    assert flow(1e-9) == pytest.approx(flow(0.0), rel=1e-7, abs=0)
+
+
 def test_a_conductivity_that_jumps_with_the_place_or_on_the_points_is_layered_too():
     def by_place(x):
         return ufl.conditional(ufl.And(ufl.gt(x[1], 0.525), ufl.lt(x[1], 0.625)), 1e-10, 1e-4)

@@ -181,7 +181,7 @@ def test_a_law_in_numpy_has_the_stress_the_tangent_and_the_state_that_it_gives(d
 @pytest.mark.parametrize(
     ("solution", "message"),
     [
-        (lambda trial: {"p": (trial["volume"], {})}, r"Wrong.solution: gives p, must give pressure"),
+        (lambda trial: {"p": (trial["volume"], {})}, r"Wrong.solution: returns p, must return pressure"),
         (lambda trial: {"pressure": (trial["volume"], {"volume": np.eye(2)})}, r"derivative of pressure by volume has"),
         (lambda trial: trial["volume"], "its result = .* must be a dict"),
         (lambda trial: trial["strain"], "raises KeyError: 'strain'"),
@@ -195,9 +195,9 @@ def test_a_law_in_numpy_has_the_stress_the_tangent_and_the_state_that_it_gives(d
         ),
         (
             lambda trial: {"pressure": (trial["volume"], {"volum": trial["volume"]})},
-            "derivative of pressure by 'volum', must be by some of volume",
+            "derivative of pressure by 'volum', must be by one of volume",
         ),
-        (lambda trial: {"pressure": (trial["volume"], {}), "p": (1, {})}, "gives pressure, p, must give pressure"),
+        (lambda trial: {"pressure": (trial["volume"], {}), "p": (1, {})}, "returns pressure, p, must return pressure"),
         (lambda trial: {"pressure": ([[1], [1, 2]], {})}, r"pressure = \[\[1\], .* must be an array of shape"),
         (lambda trial: {"pressure": (trial["volume"], {"volume": 1})}, r"by volume has shape \(\), must be \(\d+,\)"),
         (lambda trial: {"pressure": (trial["volume"][:, 3], {})}, "IndexError: .*must be numpy of trial"),
@@ -214,12 +214,12 @@ def test_one_line_says_what_is_wrong_with_a_law_in_numpy(solution, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"update": lambda pressure: {"crushed": ufl.as_vector([pressure] * 2)}}, r"gives \{'crushed': \(2,\)\}, must"),
-        ({"update": lambda pressure: {"crush": pressure}}, r"update: gives \{'crush': \(\)\}, must have some of the"),
-        ({"update": lambda pressure: {}}, r"Wrong.update: gives \{\}, must have some of .*\{'crushed': \(\)\}"),
+        ({"update": lambda pressure: {"crushed": ufl.as_vector([pressure] * 2)}}, r"returns \{'crushed': \(2,\)\}"),
+        ({"update": lambda pressure: {"crush": pressure}}, r"update: returns \{'crush': \(\)\}, must have some of the"),
+        ({"update": lambda pressure: {}}, r"Wrong.update: returns \{\}, must have some of .*\{'crushed': \(\)\}"),
         ({"update": lambda pressure: {"crushed": np.zeros(3)}}, r"Wrong.update: crushed = array.* must be UFL"),
-        ({"update": lambda pressure: {"crushed": 0.0}}, "Wrong.update: gives numbers alone, must be UFL that depends"),
-        ({"trial": lambda F: {"volume": 3.0}}, "Wrong.trial: gives {'volume': 3.0}, must have some UFL of F"),
+        ({"update": lambda pressure: {"crushed": 0.0}}, "Wrong.update: returns only numbers, must be UFL that depends"),
+        ({"trial": lambda F: {"volume": 3.0}}, "Wrong.trial: returns {'volume': 3.0}, must have some UFL of F"),
         ({"unknowns": {"pressure": np.nan}}, "Wrong: unknown 'pressure' = nan, must be numbers"),
         ({"unknowns": {"pressure": 0.0, "bulk": 0.0}}, "Wrong: the name 'bulk' is taken; parameters, state and"),
     ],
@@ -282,7 +282,7 @@ class Misnamed(Stiffening):
 
 def test_one_line_says_what_is_wrong():
     with pytest.raises(
-        ValueError, match=r"Misnamed.residual: gives .*must have the names and shapes \{'y': \(\), 'shears'"
+        ValueError, match=r"Misnamed.residual: returns .*must have the names and shapes \{'y': \(\), 'shears'"
     ) as caught:
         column(fluid=False, material=Misnamed(bulk=1e6, shear=1e6))
     assert "\n" not in str(caught.value)

@@ -295,30 +295,30 @@ def in_two_pieces(folder):
 
 
 BAD = {
-    "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces of 8 cells", "meshio reads 4"),
+    "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces with 8 cells", "meshio reads 4"),
     "a system of Nastran": (
         lambda f: written(f, BULK.replace("SYSTEM", "5"), "mesh.bdf"), "mesh: GRID in the coordinate system", "5"),
     "a file of no nodes": (lambda f: written(f, "*HEADING\n"), "mesh: has no vertices", "must have cells"),
-    "elements before nodes": (lambda f: written(f, "*ELEMENT, TYPE=CPE3\n1, 1, 2, 3\n"), "node 1", "must be one of"),
+    "elements before nodes": (lambda f: written(f, "*ELEMENT, TYPE=CPE3\n1, 1, 2, 3\n"), "node 1", "must be a number"),
     "a type of elements": (lambda f: written(f, SETS.replace("CAX4RP", "CINAX4")), "scene.inp: *ELEMENT", "CINAX4"),
     "a node that is not there": (lambda f: written(f, SETS.replace("3, 6, 5", "3, 6, 8")), "scene.inp", "node 8"),
-    "too few nodes": (lambda f: written(f, SETS.replace("3, 6, 5", "3, 6")), "TYPE=CAX4RP: 4", "5 of each"),
+    "too few nodes": (lambda f: written(f, SETS.replace("3, 6, 5", "3, 6")), "TYPE=CAX4RP: 4", "5 for each"),
     "no number": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "7, q, 3, 9")), "scene.inp", "'Q'"),
     "generated nodes": (lambda f: written(f, SETS + "*NGEN\n1, 2\n"), "scene.inp: *NGEN", "one by one"),
     "cylindrical coordinates": (lambda f: written(f, SETS.replace("NSET=ALL", "SYSTEM=C")), "SYSTEM=C", "Cartesian"),
-    "no type": (lambda f: written(f, SETS.replace(" TYPE=CAX4,", "")), "*ELEMENT: has no TYPE", "must"),
+    "no type": (lambda f: written(f, SETS.replace(" TYPE=CAX4,", "")), "*ELEMENT: option TYPE", "must"),
     "an element twice": (lambda f: written(f, SETS.replace("2, 2,", "1, 2,")), "element 1 occurs twice", "once"),
     "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 occurs twice", "once"),
-    "an unknown set": (lambda f: written(f, SETS.replace("A, b", "A, c")), "set 'C' of elements", "A, base, B"),
+    "an unknown set": (lambda f: written(f, SETS.replace("A, b", "A, c")), "element set 'C'", "A, base, B"),
     "an unknown part": (lambda f: written(f, PARTS.replace("part=Wall", "part=Wa")), "*INSTANCE Wall-1", "'Wa'"),
     "nodes of two parts where they touch": (
         lambda f: written(f, PARTS.replace(" 3., 1., 0.\n 3., 1., 0., 3., 1., 1., 90.\n", " 1.,\n")),
         "scene.inp: ", "hanging or duplicate nodes, must be merged, or belong to two parts"),
-    "half a turn": (lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: 3 and 5", "7 of a turn"),
+    "half a turn": (lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: 3 and 5", "7 of a rot"),
     "an old format of gmsh": (
         lambda f: written(f, "$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "a.msh"), "a.msh: gmsh's format 4.0", "2.2"),
     "a broken file of gmsh": (
-        lambda f: written(f, "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n", "b.msh"), "b.msh: no $Nodes", "must have it"),
+        lambda f: written(f, "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n", "b.msh"), "b.msh: section $Nodes", "must be in"),
 }  # fmt: skip
 
 

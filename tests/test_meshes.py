@@ -485,7 +485,7 @@ BAD = {
         "mesh: 12 cells overlap",
         "by 0.01 m",
     ),
-    "a node that is not there": (lambda: seed(SQUARE, [("quad", [[0, 1, 2, 4]])]), "the node 4", "one of 4"),
+    "a node that is not there": (lambda: seed(SQUARE, [("quad", [[0, 1, 2, 4]])]), "has node 4", "one of the 4"),
     "a vertex that is nowhere": (
         lambda: seed([*SQUARE[:3], (np.nan, 1, 0)], [("quad", [[0, 1, 2, 3]])]),
         "mesh",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Newton's method: exploding steps are shortened; residuals above round-off are solved for, however small."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -49,6 +49,7 @@ def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thous
         numerics=mpm.Numerics(tolerance=1e-12),
     )
     s.step(1.0)
+    s.state = replace(s.state, trend=None)  # the step begins from rest
     report = s.step(1.0)
     residuals = np.array([momentum for momentum, _ in report.history])
     assert (residuals[1] > 1e4 * residuals[0]) == shortened and residuals[1] > 3e2 * residuals[0]

@@ -277,7 +277,7 @@ def test_a_writer_made_before_the_run_was_resumed_harms_nothing(tmp_path):
     other, probe = beam(h=0.06)
     early = mpm.Writer(other, tmp_path)
     after = mpm.resume(other, checkpoint.file)
-    with pytest.raises(ValueError, match=r"writer: made at t = 0 s for a run that starts at t = 0\.04 s"):
+    with pytest.raises(ValueError, match=r"writer: made at t = 0 s, but the run starts at t = 0\.04 s; must"):
         other.run(0.06, 0.02, observe=early, after=after)
     assert list(index(tmp_path / "points.pvd")) == list(table(tmp_path / "history.csv")["t"]) == [0.0, 0.02, 0.04]
     both = r"its columns are t, .*, p_max, the run's t, .*, p_max, x_0, y_0, ux_0, uy_0, p_0;"
@@ -363,7 +363,7 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path):
     with mpm.Writer(simulation, tmp_path) as writer:
         again = mpm.Writer(simulation, tmp_path)
         other = subprocess.run([sys.executable, "-c", script, str(tmp_path)], **here)
-        assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
+        assert other.returncode == 1 and "another run writes into it, must be a separate folder" in other.stderr
     assert writer.closed and held(), "one that is open holds the folder"
     del again
     assert not held()

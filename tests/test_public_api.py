@@ -95,7 +95,7 @@ def test_contacts_stay_those_of_the_scene():
     s = mpm.Simulation(grid, bodies, [SOIL], walls=WALLS, conditions=[contact])
     s.stage(conditions=[mpm.Traction("top", (0, -1e3), region=((0, 0.9), (1, 2)))])
     assert contact in s.conditions
-    with pytest.raises(ValueError, match="contacts must be those of the scene"):
+    with pytest.raises(ValueError, match="must be the contacts of the scene"):
         s.stage(conditions=[mpm.Contact(1, 0, friction=0.3)])
 
 
@@ -108,9 +108,9 @@ def test_given_displacement_may_be_a_function_of_time_alone():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: scene(fluid=mpm.Fluid(), pressure=lambda X: X[:, 0]), r"pressure: a function of \(X\), must be of x"),
-        (lambda: scene(initial_stress=lambda y: -np.ones((len(y), 3))), r"a function of \(y\), must be of x"),
-        (lambda: mpm.Hencky(bulk=lambda x: 1e6 + x[:, 0], shear=1e6).at(np.zeros((2, 2))), r"of \(x\), must be of X"),
+        (lambda: scene(fluid=mpm.Fluid(), pressure=lambda X: X[:, 0]), r"pressure: .*\(X\), must be a function of x"),
+        (lambda: scene(initial_stress=lambda y: -np.ones((len(y), 3))), r"\(y\), must be a function of x"),
+        (lambda: mpm.Hencky(bulk=lambda x: 1e6 + x[:, 0], shear=1e6).at(np.zeros((2, 2))), r"must be a function of X"),
         (lambda: scene(gravity=lambda x: (0, -9.81)), "gravity: .* must be"),
     ],
     ids=["pressure", "initial stress", "constant of a material", "gravity"],

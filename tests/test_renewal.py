@@ -48,14 +48,14 @@ def yielded(s, strain, hardened=0.0):
 def renewed(s, points, monkeypatch, longest=1e-3):
     """Return the points with domains renewed that are longer than so many cells, and how many were."""
     monkeypatch.setattr(renewal, "LONGEST", longest)
-    own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
+    own = renewal.Renewal(s.bodies, s.scene.materials)
     state, count = own.renewed(replace(s.state, points=points))
     return state.points, count
 
 
 def strain_of(s, points):
     """Return the elastic strains (n, 3, 3)."""
-    own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
+    own = renewal.Renewal(s.bodies, s.scene.materials)
     return renewal._log(own._elastic(points, np.arange(len(points)))) / 2
 
 
@@ -69,7 +69,7 @@ def test_masses_volumes_region_and_surface_stay(monkeypatch, hole, uneven):
     assert (new.volume0 * new.J).sum() == pytest.approx((old.volume0 * old.J).sum(), rel=1e-13)
     assert volumes(new.corners).min() > 0
     assert volumes(new.corners).sum() == pytest.approx(volumes(old.corners).sum(), rel=1e-4)
-    own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
+    own = renewal.Renewal(s.bodies, s.scene.materials)
     before, after = (own._faces(points) for points in (old, new))
     assert after.area.sum() == pytest.approx(before.area.sum(), rel=1e-6 if uneven else 1e-12)  # near corners merge
     for faces, points in ((before, old), (after, new)):

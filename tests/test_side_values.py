@@ -200,7 +200,7 @@ def test_functions_are_called_by_the_names_of_their_parameters(kind):
 )
 def test_functions_of_time_alone_are_none_of_places(make):
     """One of x was called with the time."""
-    with pytest.raises(ValueError, match=r"a function of \(x\), must be of the time alone"):
+    with pytest.raises(ValueError, match=r"a function of \(x\), must be a function of the time alone"):
         make(lambda x: 1.0)
 
 

@@ -125,7 +125,7 @@ def test_walls_plates_and_given_displacements_come_and_go():
     [
         ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
         ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are still to be added, each once"),
-        ({"conditions": [mpm.Drained("top")]}, "need a fluid"),
+        ({"conditions": [mpm.Drained("top")]}, "without fluid, must be in a scene with fluid"),
         ({"gravity": (0, -1)}, "gravity: the scene has none"),
     ],
 )

@@ -168,7 +168,7 @@ def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
         return eta * ufl.inner(ufl.sym(points.grad(velocity)), ufl.sym(points.grad(v))) * points.dx
 
     for options in ({"fluid": False}, {"material": replace(SOFT, conductivity=0.0)}):
-        with pytest.raises(ValueError, match=r"rtol = 0\.01: without flow there is no error estimate .* must be dt"):
+        with pytest.raises(ValueError, match=r"without flow velocities have no error estimate, must be dt"):
             loaded(load, cells=2, terms=[damper], **options).run(20.0, rtol=1e-2)
 
     def error(steps):
@@ -326,12 +326,12 @@ def test_a_run_with_steps_by_their_error_resumes_with_the_same_bits(tmp_path):
 
 
 BAD = {
-    "no step": ({}, r"dt = None: must be given, or rtol"),
+    "no step": ({}, r"dt = None, must be given, or rtol"),
     "rtol too large": ({"rtol": 1.0}, r"rtol = 1\.0, must be in \[1e-07, 1\)"),
     "rtol below the solver's": ({"rtol": 1e-9}, r"rtol = 1e-09, must be in \[1e-07, 1\)"),
     "both output rules": ({"dt": 1.0, "rtol": 1e-3, "t_eval": [1.0]}, r"dt = 1\.0: .* must be left out"),
-    "first step of equal steps": ({"dt": 1.0, "first_step": 0.1}, r"first_step = 0\.1: needs rtol"),
-    "longest of equal steps": ({"dt": 1.0, "max_step": 0.1}, r"max_step = 0\.1: needs rtol"),
+    "first step of equal steps": ({"dt": 1.0, "first_step": 0.1}, r"first_step = 0\.1, must be given with rtol"),
+    "longest of equal steps": ({"dt": 1.0, "max_step": 0.1}, r"max_step = 0\.1, must be given with rtol"),
     "negative first step": ({"rtol": 1e-3, "first_step": -1.0}, r"first_step = -1\.0, must be > 0"),
     "times that fall": ({"rtol": 1e-3, "t_eval": [2.0, 1.0]}, r"t_eval = .*must be increasing times in \(0, 4\] s"),
     "times after the end": ({"dt": 1.0, "t_eval": [2.0, 9.0]}, r"t_eval = .*must be increasing times in \(0, 4\] s"),
@@ -350,7 +350,7 @@ def test_steps_that_cannot_be_are_refused_in_a_line(name):
 
 def test_a_method_that_has_no_error_cannot_choose_its_steps():
     s = column(cells=2, numerics=mpm.Numerics(method="backward-euler"), conditions=[OPEN])
-    with pytest.raises(ValueError, match=r"rtol = 0\.001: backward-euler has no error estimate, must be sdirk2"):
+    with pytest.raises(ValueError, match=r"rtol = 0\.001: method backward-euler has no error estimate, must be sdirk2"):
         s.run(4.0, rtol=1e-3, progress=False)
     with pytest.raises(ValueError, match=r"method 'rk4': must be one of sdirk2, backward-euler"):
         column(cells=2, numerics=mpm.Numerics(method="rk4"))

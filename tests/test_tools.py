@@ -378,7 +378,7 @@ def test_a_stage_goes_on_with_a_tool_wherever_the_step_before_left_it():
         )
         s.run(1.0, 0.1, progress=False)
         if stages == 2:
-            faces = s.scene.on_grid(s.points).cut.surface(s.state.stage.acting[0].found.faces)
+            faces = s.scene.on_grid(s.points).cut.surface(s.state.stage.acting[0].outside)
             gap = disc.shape.distance(disc.pose(s.t, 2).own(faces.now(s.points)))
             assert gap.min() < -BEGINS * grid.h.min()
             s.stage()

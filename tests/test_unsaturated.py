@@ -301,7 +301,7 @@ class Rising(Liakopoulos):
         (lambda: mpm.BrooksCorey(1e3, index=-1.0), r"BrooksCorey: index = -1.0, must be in \(0, 20\]"),
         (lambda: mpm.Gardner("wide"), "Gardner: entry = 'wide', must be > 0"),
         (lambda: mpm.Hencky(1e6, 1e6, retention=3), r"Hencky: retention = 3, must have saturation\(p\) and"),
-        (lambda: mpm.Hencky(1e6, 1e6, retention=Rising()), "saturation never falls to a half"),
+        (lambda: mpm.Hencky(1e6, 1e6, retention=Rising()), "saturation never falls to 0.5"),
     ],
 )
 def test_what_is_no_law_of_retention_is_refused(law, said):
@@ -321,7 +321,7 @@ def test_saturated_scenes_have_nothing_of_retention():
 
 def test_a_specific_yield_does_not_go_with_it():
     law = mpm.Gardner(1e3)
-    with pytest.raises(ValueError, match=r"retention beside a specific yield 0\.1, must be one of them"):
+    with pytest.raises(ValueError, match=r"retention and a specific yield 0\.1, must be only one of them"):
         mpm.Hencky(1e6, 1e6, conductivity_law=mpm.unsaturated(1e3, specific_yield=0.1), retention=law)
 
 

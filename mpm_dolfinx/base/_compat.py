@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Every spelling that differs between the supported dolfinx releases (0.5.2, 0.9 and 0.11).
+"""Wrappers of every function of dolfinx that differs between the supported releases (0.5.2, 0.9 and 0.11).
 
-The rest of the package never asks for a version.  Branches marked OLD serve 0.5.  A branch is removed when its last
-release is no longer supported.
+No other module of the package asks for the version.  Branches marked OLD serve release 0.5.  Remove a branch when
+its last release is no longer supported.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ def box_mesh(
     Parameters
     ----------
     cells : (n, 2^d)
-        Nodes of the cells that this process contributes, first axis fastest.
+        Node numbers of the cells that this process contributes; the first axis varies fastest.
     x : (m, d), m
-        Positions of the nodes that this process contributes.  Global node numbers follow the order of the ranks.
+        Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
     ranks, offsets
-        Ranks that hold cell i, its owner first: `ranks[offsets[i] : offsets[i + 1]]`.
+        Ranks that hold cell i, the owner first: `ranks[offsets[i] : offsets[i + 1]]`.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
     if OLD:
-        # FFCx sets this variant when it first compiles a form, which would change the names of later libraries
+        # FFCx sets this variant when it compiles its first form; later libraries would then have other names
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1, variant="equispaced"))
         ghosts = mesh.GhostMode.shared_facet
         lists = cpp.graph.AdjacencyList_int32(*where)
@@ -65,7 +65,7 @@ def box_mesh(
 
 
 def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, ...] = ()):
-    """Return the space of `shape`-valued functions of a family ("DG", "Lagrange") and degree."""
+    """Return the function space of a family ("DG", "Lagrange") and degree, with values of the given shape."""
     if not OLD:
         return fem.functionspace(msh, (family, degree, shape) if shape else (family, degree))
     with compiler(msh.comm):
@@ -75,7 +75,7 @@ def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, .
 def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
     cell = msh.ufl_cell()
     if family == "DG" and cell.cellname() in ("quadrilateral", "hexahedron"):
-        family = "DQ"  # ufl renames DG on boxes itself, but prints a line
+        family = "DQ"  # UFL renames DG on boxes, but prints a line
     if len(shape) == 2:
         return ufl.TensorElement(family, cell, degree, shape=shape)
     if len(shape) == 1:
@@ -84,7 +84,7 @@ def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
 
 
 def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]]):
-    """Return the mixed space of several (family, degree, shape)."""
+    """Return the mixed function space of several spaces, each given as (family, degree, shape)."""
     if OLD:
         with compiler(msh.comm):
             return fem.FunctionSpace(msh, ufl.MixedElement(*[_old_element(msh, *p) for p in parts]))
@@ -127,11 +127,11 @@ def scatter_reverse_add(u: fem.Function) -> None:
 
 
 seconds: Counter[str] = Counter()
-"""Wall time, s, of each part of a run on this process, as `Timer` adds it up."""
+"""Wall time, s, of each part of a run on this process, summed by `Timer`."""
 
 
 class Timer:
-    """Context that adds its wall time to a part's `seconds`; timers of dolfinx 0.9 count ticks of 10 ms."""
+    """Context that adds its wall time to an entry of `seconds`.  Timers of dolfinx 0.9 resolve only 10 ms."""
 
     def __init__(self, part: str):
         self._part = part
@@ -145,10 +145,10 @@ class Timer:
 
 
 class CompiledForm:
-    """A UFL form over cells or interior facets, compiled once and bound to any list of entities.
+    """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 
-    A cell may occur several times in the list; the kernel is then called once for each entry.  Only owned cells are
-    allowed, because 0.5 silently skips ghosts.  0.5 takes the list as mesh tags, later releases as an entity list.
+    A cell may occur several times in the list; the kernel is then called once for each entry.  Ghost cells are not
+    allowed, because 0.5 silently skips them.  0.5 needs mesh tags, later releases a list of entities.
 
     Parameters
     ----------
@@ -177,13 +177,13 @@ class CompiledForm:
 
     @property
     def form(self):
-        """The form with its last binding."""
+        """The form with the entities of the last call of `bind`."""
         return self._last if OLD else self._last._cpp_object
 
     def bind(self, entities: NDArray[np.int32]):
-        """Bind the form to cells (repeats allowed) or interior facets, and return the bound form.
+        """Set the cells (repeats allowed) or interior facets of the integral, and return the form for them.
 
-        The returned form keeps its entities, and may be passed to `assemble_vector` and `assemble_matrix`.
+        Later calls do not change the returned form.  `assemble_vector` and `assemble_matrix` accept it.
         """
         entities = np.ascontiguousarray(entities, dtype=np.int32)
         cells = self.integral_type == "cell"
@@ -217,25 +217,25 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return dolfinx's own packed coefficients, one row an entity."""
+        """Return the coefficients as packed by dolfinx, one row per entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`, ghosts not summed; rows: coefficients, one row an entity, instead of dolfinx's."""
+        """Add the vector to `b`, without summing ghosts.  `rows`, one per entity, replace dolfinx's coefficients."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix to `A`, with dofs unrolled and without final assembly; rows: as for the vector."""
+        """Add the matrix to `A`, with unrolled dofs, without final assembly.  `rows` replace dolfinx's coefficients."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)
 
     @cached_property
     def _keys(self) -> list[tuple]:
-        """Keys of the coefficients: integral numbers in 0.11, subdomain ids before."""
+        """Keys of the coefficients: numbers of the integrals in 0.11, subdomain ids in earlier releases."""
         return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 
@@ -256,6 +256,6 @@ def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
 
 
 def compiled(form: ufl.Form):
-    """Return `fem.form` of a form, made by the package's compiler."""
+    """Return the compiled form `fem.form(form)`, made by the package's compiler."""
     with compiler(_mesh_of(form).comm):
         return fem.form(form)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Quiet and crash-safe compilation of dolfinx's forms and function spaces, with errors of one line.
+"""Quiet and crash-safe compilation of dolfinx's forms and function spaces, with error messages of one line.
 
-FFCx marks a library in its cache before it compiles it, and waits ten seconds for a library with such a mark.  An
-aborted run leaves the mark behind, and all later runs fail.  Here each library is compiled in its own folder and
-moved into the cache when it is complete.  Incomplete or broken libraries in the cache are compiled again.
+FFCx marks a library in the cache before compiling it.  Other programs wait ten seconds for a marked library.  An
+aborted run leaves its mark behind, and all later runs fail.  Here each library is compiled in a separate folder and
+moved into the cache when complete.  Incomplete or broken libraries in the cache are compiled again.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from mpm_dolfinx.parallel.exchange import at_root, first
 WORKSHOP = ".mpm_dolfinx-"
 """Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Age, s, from which the mark of another program on a library counts as abandoned."""
+"""Age, s, after which the mark that another program left on a library is ignored."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run, by the cache folder that cannot be written."""
+"""Temporary folders of this run.  Keys: the cache folders without write permission."""
 _warnings: dict[Path, str] = {}
-"""Warnings by temporary folder, until the first compilation there."""
+"""Warnings not yet given.  Keys: temporary folders; the first compilation there gives the warning."""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
     Raises
     ------
     OSError
-        In one line, on all processes: unreadable settings, no writable folder, or a C compiler that fails.
+        On all processes, in one line: unreadable settings, no writable folder, or failure of the C compiler.
     """
     folder = at_root(comm, _folder)
     messages = [""]
@@ -66,7 +66,7 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
             yield
     except Exception as error:
         raised = error
-    message = first(comm, messages[-1])  # dolfinx tells the other processes only that one has failed
+    message = first(comm, messages[-1])  # dolfinx reports to the other processes only that one has failed
     if message:
         raise OSError(message) from raised
     if raised is not None:
@@ -77,7 +77,7 @@ MAKERS = [name for name in ("compile_forms", "compile_elements") if hasattr(libr
 
 
 def _folder() -> Path:
-    """Return the folder for libraries: dolfinx's cache or, if it cannot be written, a folder of this run."""
+    """Return the folder for libraries: dolfinx's cache or, if it is not writable, a temporary folder of this run."""
     try:
         _ffcx_settings()
         cache = _settings()["cache_dir"]
@@ -97,27 +97,27 @@ def _folder() -> Path:
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
-    """Return a new folder for libraries, removed at the end of the run."""
+    """Return a new folder for libraries, which is removed at the end of the run."""
     allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
-    what = f"{cache}: {why.strerror}: dolfinx keeps there what it compiles"
+    what = f"{cache}: {why.strerror}: cache folder of dolfinx's compiled forms"
     try:
         folder = Path(tempfile.mkdtemp(prefix="mpm_dolfinx-"))
     except OSError as error:
         raise OSError(f"{what}, and {line_of(error)}, {allowed}") from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    _warnings[folder] = f"{what}, {allowed}; until then every run compiles anew, in {folder}"
+    _warnings[folder] = f"{what}, {allowed}; until then each run compiles all forms again, in {folder}"
     return folder
 
 
 def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
-    """Return FFCx's function that makes a library, in a version that only leaves complete libraries behind.
+    """Return a version of FFCx's compiling function `make` that leaves only complete libraries behind.
 
     Parameters
     ----------
     folder
         Folder for new libraries.
     messages
-        List to which errors of compiler and disk are appended.
+        List to which errors of the compiler and of the disk are appended.
     """
 
     def find_or_make(*objects, cache_dir, **settings):
@@ -129,7 +129,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
                     if _is_complete(place, name):
                         module = _loaded(name, _library(place, name))
                         return [getattr(module.lib, one) for one in names], module
-            return find(name, names, workshop, timeout)  # makes the workshop, which is empty
+            return find(name, names, workshop, timeout)  # finds nothing and creates the workshop
 
         try:
             with _replaced(get_cached_module=look):
@@ -137,7 +137,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
             if workshop.exists():
                 if folder in _warnings:
                     logger.warning(_warnings.pop(folder))
-                with suppress(OSError):  # the library is loaded already; a later run compiles it again
+                with suppress(OSError):  # the library is already loaded; a later run compiles it again
                     _publish(workshop, folder)
             return out
         except cffi.VerificationError as error:
@@ -145,7 +145,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
             messages.append(f"C compiler: {line_of(error)}, {allowed}")
             raise
         except OSError as error:
-            allowed = "must be a folder that can be written, with room, or set XDG_CACHE_HOME to another"
+            allowed = "must be a folder that can be written, with free space, or set XDG_CACHE_HOME to another"
             messages.append(f"{folder}: {line_of(error)}, {allowed}")
             raise
         finally:
@@ -156,7 +156,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
 
 @cache
 def _loaded(name: str, library: Path) -> ModuleType:
-    """Return the module of a library; FFCx's way lists all of the cache, for each form of each scene."""
+    """Return the module of a library.  FFCx's loader would list the whole cache, for each form of each scene."""
     spec = spec_from_file_location(name, library)
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -164,28 +164,28 @@ def _loaded(name: str, library: Path) -> ModuleType:
 
 
 def _library(place: Path, name: str) -> Path | None:
-    """Return the file of a library that Python would load, None if there is none."""
+    """Return the file of a library that Python would load; None if no such file exists."""
     return next(filter(Path.exists, (place / (name + suffix) for suffix in EXTENSION_SUFFIXES)), None)
 
 
 def _is_complete(place: Path, name: str) -> bool:
-    """Return whether a library is in the cache, marked as ready, with its source, and not truncated.
+    """Return whether the cache holds a complete library: its source, the mark of readiness, and an untruncated file.
 
-    The loader does not notice a truncated library: the run ends with a bus error at the first missing page.
+    Python's loader does not notice truncation: the run ends with a bus error at the first missing page.
     """
     library = _library(place, name)
     if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):
         return False
     with open(library, "rb") as f:
         head = f.read(64)
-    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not a Linux library: its loader may check itself
+    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not a Linux library: other loaders may check themselves
         return len(head) == 64
     (table,), (size, count) = struct.unpack_from("=Q", head, 0x28), struct.unpack_from("=2H", head, 0x3A)
     return library.stat().st_size >= table + size * count  # linkers write the section table last
 
 
 def _publish(workshop: Path, folder: Path) -> None:
-    """Move a library into the cache, unless it is there or another program is about to put it there."""
+    """Move a library into the cache, unless it exists there or another program is compiling it."""
     (source,) = workshop.glob("*.c")
     mark, name = folder / source.name, source.stem
     ready = mark.with_suffix(".c.cached")
@@ -203,7 +203,7 @@ def _publish(workshop: Path, folder: Path) -> None:
 
 @contextmanager
 def _replaced(**functions: Callable) -> Iterator[None]:
-    """Replace functions of FFCx's module by others of the same names."""
+    """Replace functions of FFCx's module by functions with the same names, within this context."""
     before = {name: getattr(libraries, name) for name in functions}
     for name, function in functions.items():
         setattr(libraries, name, function)
@@ -216,7 +216,7 @@ def _replaced(**functions: Callable) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress setuptools' log lines about compiler calls, and restore the root logger afterwards."""
+    """Suppress the log lines of setuptools about compiler calls.  The root logger is restored afterwards."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     root.addFilter(_is_wanted)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check of the environment before other imports: one line names missing packages and the remedy."""
+"""Check of the environment before other imports; errors name missing packages and the remedy in one line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _check() -> None:
         )
     try:
         Path.home()
-    except RuntimeError as error:  # Open MPI fails without HOME, and dolfinx with it
+    except RuntimeError as error:  # without HOME Open MPI fails, and so does dolfinx
         raise ImportError("HOME is not set, dolfinx needs it: set it to a folder that can be written") from error
 
     from mpi4py import MPI  # noqa: F401 - initialises MPI before PETSc does

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The package's one kind of cache: the last value, with its key, compared by value."""
+"""The package's only kind of cache: the last value together with its key.  Keys are compared by value."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ T = TypeVar("T")
 class Latest(Generic[T]):
     """Cache of the last value.
 
-    The cache is empty while a value is made, so an exception leaves no incomplete value behind.
+    The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
     """
 
     def __init__(self) -> None:
         self._entry: tuple[Any, T] | None = None
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
-        """Return the value of a key; a new value is made if the key differs from the last one.
+        """Return the value for a key; compute the value again if the key differs from the last key.
 
         Parameters
         ----------
         key
-            Everything on which the value depends: numbers, objects, arrays that are never changed, or tuples of these.
+            Everything on which the value depends: numbers, objects, arrays that never change, or tuples of these.
         make
-            Function that makes the value.
+            Function that computes the value.
         comm
-            Processes that make the value together: if one process needs a new value, all make one.
+            Processes that compute the value together.  If one process needs a new value, all compute it.
         """
         other = self._entry is None or not same(self._entry[0], key)
         if other if comm.size == 1 else over_all(comm, other) > 0:
@@ -45,7 +45,7 @@ class Latest(Generic[T]):
 
     @property
     def value(self) -> T | None:
-        """The value, None if there is none."""
+        """The last value; None if the cache is empty."""
         return None if self._entry is None else self._entry[1]
 
     def clear(self) -> None:
@@ -54,7 +54,7 @@ class Latest(Generic[T]):
 
 
 class Keyed:
-    """Base of objects that enter cache keys by a token, `key`, so that caches do not keep them alive."""
+    """Base class of objects that are identified in cache keys by a token, so that caches do not keep them alive."""
 
     @cached_property
     def key(self) -> object:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Report of a step, and the errors that end a step."""
+"""Report of a time step, and the errors that end a step."""
 
 from __future__ import annotations
 
@@ -11,49 +11,40 @@ import numpy as np
 
 @dataclass
 class Report:
-    """Report of a converged step.
+    """Report of a converged time step.  Pressures are cell pressures; see `motion_error` for the motion."""
 
-    newton, coupling: iterations; history: relative residuals (momentum, storage); balance: relative error of the fluid
-    balance; rederived: inverted particle domains that were re-initialised from F; renewed: domains replaced by renewal;
-    easy: whether a longer step may converge too.  Pressures of cells, Pa: error: estimated error; change: largest
-    change in the step; extremes: minimum and maximum; sealed: largest change of the same step without flow; first:
-    largest change in the first substep; sudden: `first` if the second substep changes little more, else 0.  stress:
-    root mean square of the nodal forces over the area of a cell face, Pa; moves: estimated error of the motion, and the
-    motion, see `motion_error`; fills: estimated error and largest change of the water content, for unsaturated soil.
-    """
-
-    newton: int = 0
-    coupling: int = 0
-    history: list[tuple[float, float]] = field(default_factory=list)
-    balance: float = 0.0
-    rederived: int = 0
-    renewed: int = 0
-    easy: bool = True
-    error: float = 0.0
-    change: float = 0.0
-    extremes: tuple[float, float] | None = None
-    sealed: float = 0.0
-    first: float = 0.0
-    sudden: float = 0.0
-    stress: float = 0.0
-    moves: tuple[float, float] = (0.0, 0.0)
-    fills: tuple[float, float] = (0.0, 0.0)
+    newton: int = 0  # Newton iterations
+    coupling: int = 0  # iterations of the coupled linear solver
+    history: list[tuple[float, float]] = field(default_factory=list)  # relative residuals (momentum, storage)
+    balance: float = 0.0  # relative error of the fluid balance
+    rederived: int = 0  # number of inverted particle domains that were initialised again from F
+    renewed: int = 0  # number of particle domains replaced by renewal
+    easy: bool = True  # whether a longer step may converge too
+    error: float = 0.0  # estimated error of the pressures, Pa
+    change: float = 0.0  # largest pressure change in the step, Pa
+    extremes: tuple[float, float] | None = None  # minimum and maximum pressure, Pa
+    sealed: float = 0.0  # largest pressure change, Pa, in the same step without flow
+    first: float = 0.0  # largest pressure change in the first substep, Pa
+    sudden: float = 0.0  # `first` if pressures change little more in the second substep, else 0
+    stress: float = 0.0  # root mean square of the nodal forces, divided by the area of a cell face, Pa
+    moves: tuple[float, float] = (0.0, 0.0)  # estimated error of the motion, and the motion
+    fills: tuple[float, float] = (0.0, 0.0)  # estimated error and largest change of the water content, unsaturated soil
 
 
 class StepFailed(RuntimeError):
-    """A step that could not be taken; a shorter step may succeed.
+    """A time step that failed; a shorter step may succeed.
 
     Attributes
     ----------
     history
-        Relative residuals (momentum, storage) of its iterations, empty if there were none.
+        Relative residuals (momentum, storage) of the iterations; empty if there were none.
     """
 
     history: Sequence[tuple[float, float]] = ()
 
 
 class NotConverged(StepFailed):
-    """A step without a solution; `history` has its relative residuals (momentum, storage)."""
+    """A time step without a converged solution."""
 
     def __init__(self, reason: str, history: Sequence[tuple[float, float]] = ()):
         finite = [h for h in history if np.isfinite(h).all()]
@@ -66,7 +57,7 @@ class NotConverged(StepFailed):
 
 
 class LeftGrid(StepFailed):
-    """A material point outside the grid after a converged step.
+    """A material point that is outside the grid after a converged step.
 
     Attributes
     ----------
@@ -80,7 +71,7 @@ class LeftGrid(StepFailed):
 
 
 def raise_interrupt(error: BaseException) -> None:
-    """Raise the KeyboardInterrupt that caused an error: some PETSc releases replace it within a solver."""
+    """Raise the KeyboardInterrupt that caused an error.  Some PETSc releases replace it by an error of the solver."""
     cause = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Fluid content of the pores, the stored quantity of the fluid balance.
+"""Fluid content of the pores: the quantity stored in the fluid balance.
 
-Per reference volume, d zeta = alpha dJ + S J dp.  With n = 1 - (1 - n0) / J the storage coefficient
-S = n / K_w + (alpha - n) / K_s makes S J = a J + b linear in J, with a = S(n = 1).  Then
+Per reference volume, d zeta = alpha dJ + S J dp, with the storage coefficient S = n / K_w + (alpha - n) / K_s.  The
+porosity is n = 1 - (1 - n0) / J.  Therefore S J = a J + b is linear in J, with a = S(n = 1), and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
-The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is the
-change of this mass, divided by rho at the mean pressure of the step.  It is second-order accurate for any path, and
-zero without flow for any step size.
+The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
+computed as the change of this mass, divided by rho at the mean pressure of the step.  This change is
+second-order accurate for any path, and zero without flow for any step size.
 
-Fluxes between cells conserve mass.  The mass flux of fluid of density rho_w exp(p / K_w) is -rho_w kappa grad pi with
+Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi with
 pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  The density between two pressures is the logarithmic mean
 (pi+ - pi-) / (p+ - p-).
 """
@@ -24,16 +24,16 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import EPSILON
 
 SERIES = (120 * EPSILON) ** 0.25
-"""Arguments below which sinh(z) / z is 1 + z^2 / 6.  Source: exact, the next term is z^4 / 120."""
+"""Argument z below which sinh(z) / z is computed as 1 + z^2 / 6.  Source: exact, the next term is z^4 / 120."""
 
 
 def change_of_content(alpha, a, storage, J, dp):
-    """Return the change of the fluid content in a step, per volume at its start, as UFL.
+    """Return the change of the fluid content in a step, per volume at the start of the step, as a UFL expression.
 
     Parameters
     ----------
     alpha, a, storage
-        Biot coefficient; storage coefficients at a porosity of one and at the start of the step, 1/Pa.
+        Biot coefficient; storage coefficient at a porosity of one; storage coefficient at the start of the step, 1/Pa.
     J
         Volume ratio of the step.
     dp
@@ -44,7 +44,7 @@ def change_of_content(alpha, a, storage, J, dp):
 
 
 def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
-    """Return the same change at points, as arrays (n,)."""
+    """Return the change of the fluid content (n,) of points in a step; see `change_of_content`."""
     z = a * dp / (2 * alpha)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)
@@ -52,27 +52,27 @@ def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
 
 
 def mass_potential(p, bulk: float):
-    """Return the mass potential pi (n,), Pa, of pressures p (n,), Pa; its gradient drives mass flux; bulk: K_w, Pa."""
+    """Return the mass potential pi (n,), Pa, at pressures p (n,), Pa.  `bulk` is K_w, Pa."""
     return p if np.isinf(bulk) else bulk * np.expm1(p / bulk)
 
 
 def pressure_of(pi, bulk: float):
-    """Return the pressures (n,), Pa, of mass potentials (n,), Pa; bulk: K_w, Pa."""
+    """Return the pressures (n,), Pa, at mass potentials pi (n,), Pa.  `bulk` is K_w, Pa."""
     return pi if np.isinf(bulk) else bulk * np.log1p(pi / bulk)
 
 
 def mass_potential_form(p, compliance):
-    """Return the mass potential, Pa, as UFL; compliance: 1 / K_w, 1/Pa."""
+    """Return the mass potential, Pa, as a UFL expression.  `compliance` is 1 / K_w, 1/Pa."""
     return p * density_between(p, 0.0, compliance)
 
 
 def density_between(p0, p1, compliance):
-    """Return the logarithmic mean of the densities at two pressures, over the density at zero pressure, as UFL."""
+    """Return the logarithmic mean of the densities at two pressures, relative to zero pressure, as a UFL expression."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the same at pressures (n,), Pa, of arrays; bulk: K_w, Pa."""
+    """Return the mean of `density_between` for arrays of pressures (n,), Pa.  `bulk` is K_w, Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

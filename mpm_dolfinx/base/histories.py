@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories of a run: rows in growing arrays that all results of the run share."""
+"""Histories of a run: quantities at each output time, in growing arrays shared by all results of the run."""
 
 from __future__ import annotations
 
@@ -18,20 +18,15 @@ def _none(*shape: int) -> NDArray[np.float64]:
 
 
 class Row(NamedTuple):
-    """Quantities at one output time.  Arrays are empty for quantities that were not requested, or without fluid.
+    """Quantities at one output time.  An array is empty if the quantity was not requested or there is no fluid."""
 
-    t: time, s; displacement, position (m, d): values at the probes, m; pressure (2,): extremes on the points, Pa;
-    probe_pressure (m,), probe_stress (m, 3, 3): pore pressure and effective stress (tension positive) at the probes,
-    Pa, see `probe_fields`; outcome: effects of the conditions on the bodies, see `State`.
-    """
-
-    t: float
-    displacement: NDArray[np.float64] = _none(0, 0)
-    pressure: NDArray[np.float64] = _none(0)
-    position: NDArray[np.float64] = _none(0, 0)
-    probe_pressure: NDArray[np.float64] = _none(0)
-    probe_stress: NDArray[np.float64] = _none(0, 3, 3)
-    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = {}
+    t: float  # time, s
+    displacement: NDArray[np.float64] = _none(0, 0)  # of the probes (m, d), m
+    pressure: NDArray[np.float64] = _none(0)  # minimum and maximum pore pressure of the points (2,), Pa
+    position: NDArray[np.float64] = _none(0, 0)  # of the probes (m, d), m
+    probe_pressure: NDArray[np.float64] = _none(0)  # pore pressure at the probes (m,), Pa, see `probe_fields`
+    probe_stress: NDArray[np.float64] = _none(0, 3, 3)  # effective stress there, tension positive (m, 3, 3), Pa
+    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = {}  # reactions, outflows and the like, see `State`
 
 
 COLUMNS = tuple(name for name in Row._fields if name != "outcome")
@@ -39,7 +34,7 @@ COLUMNS = tuple(name for name in Row._fields if name != "outcome")
 
 
 class _Columns:
-    """Arrays (capacity, ...) by name, and the outcomes; the first `used` rows are filled."""
+    """Storage of the histories: an array (capacity, ...) per quantity, and the outcomes; `used` rows are filled."""
 
     def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
         self.arrays, self.outcomes = arrays, outcomes
@@ -49,7 +44,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Return the first `count` rows in arrays of a larger capacity and these row shapes, padded with nan."""
+        """Return the first `count` rows in larger arrays, padded with nan to the given capacity and row shapes."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((capacity, *shape), np.nan)
@@ -60,15 +55,15 @@ class _Columns:
 
 
 class Rows(Sequence[Row]):
-    """Immutable rows of the histories of a run.
+    """Immutable sequence of the quantities at all output times of a run, a `Row` each.
 
-    An extended object shares its arrays with the previous one, so the cost of a row does not depend on their number.
-    Rows of different length, as from stage to stage, are padded with nan.
+    An extended object shares its arrays with the previous one, so appending a row takes the same time in long runs.
+    Rows of different length, as in stages with different conditions, are padded with nan.
 
     Attributes
     ----------
     run
-        Token shared by all histories that start from the same first row.
+        Token shared by all histories that were extended from the same object.
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
@@ -83,7 +78,7 @@ class Rows(Sequence[Row]):
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
         """Return the rows with these columns, name -> values (n, ...), and these outcomes (n,).
 
-        ValueError for missing or unknown columns, or different lengths.
+        Raise ValueError if columns are missing or unknown, or differ in length.
         """
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
@@ -108,11 +103,11 @@ class Rows(Sequence[Row]):
 
     @property
     def outcomes(self) -> list[Mapping[str, Mapping[str, NDArray[np.float64]]]]:
-        """Effects of the conditions on the bodies, as a new list."""
+        """Reactions, outflows and other effects of the conditions at each output time, as a new list."""
         return self._columns.outcomes[: self._count]
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Return one quantity (n, ...) as a read-only view."""
+        """Return the values of one quantity at all output times (n, ...), as a read-only view."""
         if not len(self):
             return np.array([getattr(Row(0.0), name)])[:0]
         out = self._columns.arrays[name][: self._count]
@@ -120,12 +115,12 @@ class Rows(Sequence[Row]):
         return out
 
     def more(self, row: Row) -> Rows:
-        """Return these rows and a further one."""
+        """Return histories with one row appended."""
         columns, n = self._columns, self._count
         values = {name: np.asarray(value, dtype=np.float64) for name, value in zip(COLUMNS, row, strict=False)}
         old = {name: rows.shape[1:] if n else values[name].shape for name, rows in columns.arrays.items()}
         shapes = {name: tuple(np.maximum(v.shape, old.get(name, v.shape))) for name, v in values.items()}
-        if columns.used != n or shapes != old:  # another object has extended the arrays, or the row is longer
+        if columns.used != n or shapes != old:  # another object has extended the arrays, or the new row is longer
             columns = columns.reshaped(n, max(8, 2 * n), shapes)
         elif n == len(columns.arrays["t"]):
             columns.arrays = columns.reshaped(n, 2 * n, shapes).arrays

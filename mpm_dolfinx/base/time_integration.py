@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Time integration: the substeps of a step, shared by the material point method and the finite element reference.
+"""Time integration: the substeps (stages) of a time step, also used by the finite element reference solution.
 
-Momentum has no time derivative without inertia.  The fluid content zeta of a cell satisfies zeta' + Q(u, p) = 0.  With
-the subscript n at the start of a step,
+Without inertia the momentum balance has no time derivative.  The fluid content zeta of a cell satisfies
+zeta' + Q(u, p) = 0 with the net outflow Q.  With the subscript n at the start of a step,
 
     backward-euler   zeta(u, p) - zeta_n + dt Q(u, p) = 0,
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
-With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  It needs no rate at the
-start of the step, which the remap would make noisy.  (u2, p2) is the end of the step.  After a jump of the loads one
-long step overshoots by a fifth, two halves of it do not: see `step_size`.  The rates of the two substeps give the
-error estimate of the step: see `solve.newton.note_pressures`.
+With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method needs no rate at
+the start of the step; there the transfer between grids would make rates noisy. (u2, p2) is the end of the step.  After
+a jump of the loads, one long step overshoots by a fifth, two steps of half the length do not: see `step_size`.  The
+error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,11 @@ GAMMA = 1 - 1 / np.sqrt(2)  # Source: Alexander (1977), the L-stable method of t
 
 @dataclass(frozen=True)
 class Substep:
-    """A stage of a diagonally implicit Runge-Kutta method, as fractions of the step.
+    """A stage of a diagonally implicit Runge-Kutta method; numbers are fractions of the step."""
 
-    end: time of its equilibrium; own: weight of its rate; before: weight of the rate of the previous substep.
-    """
-
-    end: float
-    own: float
-    before: float
+    end: float  # c_i: time at which the stage is in equilibrium
+    own: float  # a_ii: weight of the rate of this stage
+    before: float  # a_i,i-1: weight of the rate of the previous stage
 
 
 METHODS = {
@@ -45,14 +42,14 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement of a first substep that gives a prescribed motion its exact velocity.
+    """Return the displacement in the first substep that gives a prescribed motion its exact velocity.
 
-    The method implies u = share dt v in that substep, and the velocity at the end follows from both substeps.
-    Prescribed u in both substeps gives first-order velocities, and no convergence of the accelerations.  Here v is the
-    velocity of the parabola through the three displacements.
+    With share = gamma, the method implies u = share dt v in the first substep; both substeps give the velocity at the
+    end.  If u is prescribed in both substeps, velocities are first-order accurate and accelerations do not converge.
+    Here v is the velocity of the parabola through the three displacements.
 
-    share: end of the substep as a fraction of the step; start, now, end: displacements at the start of the step, at the
-    end of the substep and at the end of the step.
+    `share` is the end of the substep as a fraction of the step.  The displacements are `start` at the
+    start of the step, `now` at the end of the substep and `end` at the end of the step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 
@@ -61,13 +58,7 @@ EULER = METHODS["backward-euler"]
 
 
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:
-    """Return the substeps of a method; a scene without time derivatives has one.
-
-    Raises
-    ------
-    ValueError
-        Unknown method.
-    """
+    """Return the substeps of a method.  A scene without time derivatives has one substep."""
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method {method!r}: must be one of {', '.join(METHODS)}")
     return METHODS[method if evolves else "backward-euler"]

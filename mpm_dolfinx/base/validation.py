@@ -1,39 +1,42 @@
 # SPDX-License-Identifier: MIT
 """Validation of user values, given as numbers or as functions of time and position.
 
-An error message has one line: the object, the value, and the allowed values.
+An error message is one line: the object, the value, and the allowed values.
 
-Functions are called by the names of their parameters:
+The parameter names of a function decide its arguments:
 
 t
     Time, s, at the ends of the substeps, see `time_integration`.
 X : (m, d), m
     Reference positions of m places.
 x : (m, d), m
-    Positions of the same places at the start of the step, as for a water level.
+    Positions of the same places at the start of the step, for example to prescribe a water level.
 
-A single parameter of another name is the time.  Other names raise an error.  Parameters with defaults keep them.
-Material constants are functions of X; initial pressures and stresses are functions of x, the seeded positions.
+A single parameter with another name is the time.  Other names raise an error.  Parameters with defaults keep them.
+Material constants are functions of X.  Initial pressures and stresses are functions of x, the seeded positions.
 
-A function of position returns a number or an array (m,); where vectors are allowed, also a vector (d,) or an array
-(m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.
+A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
+or an array (m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from inspect import Parameter, signature
 from math import inf
 from pathlib import Path
 from types import FunctionType, MethodType
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-LONGEST = 160  # characters of a value in a message
+LONGEST = 160  # most characters of a value in a message
+_known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
+"""Parameters of functions that have been called."""
 
 
 def line(value) -> str:
@@ -88,7 +91,7 @@ def numbers(
 
 
 def whole(name: str, value, least: int = 1) -> int:
-    """Return an integer >= `least`; ValueError otherwise."""
+    """Return the value as an integer >= `least`; raise ValueError for other values."""
     allowed = f"an integer >= {least}"
     return int(numbers(name, value, allowed=allowed, test=lambda v: (least <= v) & (v < inf) & (v == np.floor(v))))
 
@@ -106,7 +109,7 @@ def flag(name: str, value) -> None:
 
 
 def chosen(name: str, values, among: Sequence[int], what: str) -> None:
-    """Raise a ValueError if values are not a list of distinct allowed indices."""
+    """Raise a ValueError unless values are a list of distinct indices from `among`."""
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise ValueError(f"{name} = {line(values)}, must be a list of {what}")
     for i, value in enumerate(values):
@@ -136,7 +139,7 @@ def functions(name: str, values) -> None:
 
 
 def asked(name: str, allowed: str, function: Callable, *values):
-    """Return the value of a user's function; its exceptions become a ValueError that names the object."""
+    """Return the value of a user's function.  Exceptions become a ValueError that names the object."""
     try:
         return function(*values)
     except Exception as error:
@@ -144,7 +147,7 @@ def asked(name: str, allowed: str, function: Callable, *values):
 
 
 def path(name: str, value) -> Path:
-    """Return a value as a path; ValueError otherwise."""
+    """Return a value as a path; raise ValueError if it is neither text nor a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise ValueError(f"{name} = {line(value)}, must be a path")
     return Path(value)
@@ -152,7 +155,7 @@ def path(name: str, value) -> Path:
 
 @contextmanager
 def on_disk(name: str, allowed: str) -> Iterator[None]:
-    """Add the object and the remedy to an OSError, such as for a missing folder or a full disk."""
+    """Add the object and the remedy to an OSError, for example for a missing folder or a full disk."""
     try:
         yield
     except OSError as error:
@@ -161,15 +164,15 @@ def on_disk(name: str, allowed: str) -> Iterator[None]:
 
 
 Places = Callable[[str], NDArray[np.float64]]
-"""Function that returns positions (m, d), m, by their name, "X" or "x"."""
+"""Function that returns the positions (m, d), m, of places: reference ("X") or current ("x")."""
 PLACES = ("X", "x")
 NAMES = ("t", *PLACES)
 PLAIN = (FunctionType, MethodType)
-LIBRARIES = ("numpy", "scipy")  # their functions name any argument x
+LIBRARIES = ("numpy", "scipy")  # their functions call any argument x
 
 
 def _plain(function: Callable) -> bool:
-    """Return whether the author of the scene chose the parameter names of a function."""
+    """Return whether the author of the scene chose the parameter names of the function."""
     while isinstance(function, partial):
         function = function.func
     library = str(getattr(function, "__module__", None)).partition(".")[0] in LIBRARIES
@@ -178,7 +181,9 @@ def _plain(function: Callable) -> bool:
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:
-    """Return the parameters with which a function is called; None if they are unknown."""
+    """Return the parameters to which arguments are passed; None if they are unknown."""
+    with suppress(KeyError, TypeError):  # some objects have no hash
+        return _known[function]
     try:
         every = list(signature(function).parameters.values())
     except (TypeError, ValueError):  # some built-in functions
@@ -186,16 +191,19 @@ def _parameters(function: Callable) -> list[Parameter] | None:
     named = [p for p in every if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     if not named and any(p.kind == p.VAR_POSITIONAL for p in every):
         return None
-    return [p for p in named if p.default is p.empty] or named
+    out = [p for p in named if p.default is p.empty] or named
+    with suppress(TypeError):
+        _known[function] = out
+    return out
 
 
 def takes(function: Callable) -> tuple[str, ...] | None:
-    """Return the names among t, X and x with which a function is called; None for other parameters."""
+    """Return the arguments of a function, among t, X and x; None if it has other parameters."""
     return _names(function, _parameters(function))
 
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
-    """Return the same, given the parameters."""
+    """Return the arguments of a function with these parameters; see `takes`."""
     names = ("t",) if parameters is None else tuple([p.name for p in parameters])
     if len(names) == 1 and names[0] not in PLACES:
         return ("t",)
@@ -210,7 +218,7 @@ def by_place(value) -> bool:
 
 
 def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> tuple[str, ...]:
-    """Return the names among t, X and x with which a function is called.
+    """Return the arguments of a function, among t, X and x.
 
     Raises
     ------
@@ -223,9 +231,9 @@ def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> 
     given = ", ".join(p.name for p in _parameters(function) or ())
     if given == "x" and "x" in among:  # such as an interpolation in time
         raise ValueError(f"{what}: an object or a library's function of x, must be lambda t: ..., or lambda x: ...")
-    allowed = "must be of the time alone"
+    allowed = "must be a function of the time alone"
     if len(among) > 1:
-        allowed = f"must be of {', '.join(among[:-1])} or {among[-1]} by these names, or of the time alone"
+        allowed = f"must be a function of {', '.join(among[:-1])} or {among[-1]}, so named, or of the time alone"
     raise ValueError(f"{what}: a function of ({given}), {allowed}")
 
 
@@ -241,17 +249,17 @@ def called(function: Callable, values: dict) -> object:
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
-    """Return the value of a function of one kind of position, "X" or "x", which its parameter must be named.
+    """Return the value of a function of positions, whose single parameter must be called `name`, "X" or "x".
 
     Raises
     ------
     ValueError
-        The function has other parameters, or raises.
+        The function has other parameters, or raises an exception.
     """
     names = [p.name for p in _parameters(function) or ()]
     if _plain(function) and names != [name]:
         kind = {"X": "reference positions", "x": "positions as seeded"}[name]
-        raise ValueError(f"{what}: a function of ({', '.join(names)}), must be of {name}, the {kind}")
+        raise ValueError(f"{what}: a function of ({', '.join(names)}), must be a function of {name}, the {kind}")
     return asked(what, allowed, function, places)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Reader of Abaqus (and CalculiX) input files as meshio meshes, with placed instances, sets and surfaces.
+"""Reader of Abaqus (and CalculiX) input files: a meshio mesh with placed instances, sets and surfaces.
 
-meshio's own reader keeps only the nodes of the last part, and ignores the placement of instances.
+meshio's reader keeps only the nodes of the last part, and ignores the placement of instances.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Element types by name, with numbers of nodes, or for beams with their order."""
+"""Patterns of element types.  The group is the number of nodes, or for beams the order."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -45,7 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements: its written name, and its entries (instance or "", numbers or name of a set)."""
+    """A set of elements.  Each entry is an instance, or "", with element numbers or the name of another set."""
 
     name: str
     internal: bool
@@ -54,16 +54,14 @@ class _Set:
 
 @dataclass
 class _Scope:
-    """Definitions of a part, or outside of parts; sets and surfaces are keyed by names in capitals.
-
-    nodes: (numbers (n,), positions (n, 3)); cells: (kind, numbers (m,), node numbers (m, k)); surfaces: name ->
-    (instance, set or number of elements, face).
-    """
+    """Definitions inside a part, or outside all parts.  Keys of sets and surfaces are names in capitals."""
 
     name: str = ""
-    nodes: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=list)
+    nodes: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=list)  # numbers (n,), x (n, 3)
+    # cell type, element numbers (m,), node numbers (m, k)
     cells: list[tuple[str, NDArray[np.int64], NDArray[np.int64]]] = field(default_factory=list)
     sets: dict[str, _Set] = field(default_factory=dict)
+    # name, and pairs of a set or element with a face
     surfaces: dict[str, tuple[str, list[tuple[str, str]]]] = field(default_factory=dict)
 
     def entry(self, options: Mapping[str, str], instance: str, rows: NDArray[np.int64] | str) -> None:
@@ -74,7 +72,7 @@ class _Scope:
 
 @dataclass
 class _Placed:
-    """A scope with its placement: of an instance, or unmoved."""
+    """Definitions of a part with the placement of an instance, or without a placement."""
 
     scope: _Scope
     name: str = ""
@@ -82,7 +80,7 @@ class _Placed:
     rotation: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the placed positions (n, 3): translated, then rotated about an axis."""
+        """Return positions x (n, 3) after placement: translated, then rotated about an axis."""
         x = x + self.shift
         if not self.rotation:
             return x
@@ -94,7 +92,7 @@ class _Placed:
 
 
 def is_abaqus(file: Path) -> bool:
-    """Return whether a file is an Abaqus input file: `.inp` with keywords, unlike AVS files of this name."""
+    """Return whether a file is an Abaqus input file: its suffix is `.inp` and it has keywords, unlike AVS files."""
     if file.suffix.lower() != ".inp" or not file.is_file():
         return False
     with file.open(errors="replace") as lines:
@@ -102,12 +100,12 @@ def is_abaqus(file: Path) -> bool:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of an input file; its parts are element sets and instances, its sides are surfaces."""
+    """Return the mesh of an input file.  Parts are element sets and instances; sides are surfaces."""
     return _assembled(_placed(file))
 
 
 def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield each keyword with its options and data lines, also from included files."""
+    """Yield each keyword of the file and of included files, with options and data lines."""
     keyword, rows = "", []
     with file.open(errors="replace") as lines:
         for line in map(str.strip, lines):
@@ -140,7 +138,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside of parts, then all instances, or all parts if there are no instances."""
+    """Return the definitions outside of parts, then of all instances, or of all parts if no instance exists."""
     whole = _Scope()
     scope = whole
     parts = {}
@@ -153,13 +151,13 @@ def _placed(file: Path) -> list[_Placed]:
         elif keyword == "INSTANCE":
             if "PART" not in options or options["PART"].upper() not in parts:
                 what = f"*INSTANCE {options.get('NAME', '')}: part {options.get('PART', 'none')!r}"
-                raise ValueError(f"{what}, must be one of the file's: {', '.join(p.name for p in parts.values())}")
+                raise ValueError(f"{what}, must be a part of the file: {', '.join(p.name for p in parts.values())}")
             of = parts[options["PART"].upper()]
             scope = deepcopy(of)
             shift, turn = ([float(v) for v in row.split(",") if v.strip()] for row in (*rows, "", "")[:2])
             if len(shift) > 3 or len(turn) not in (0, 7):
                 what = f"*INSTANCE {options['NAME']}: {len(shift)} and {len(turn)} numbers"
-                raise ValueError(f"{what}, must be 3 of a shift and 7 of a turn")
+                raise ValueError(f"{what}, must be 3 of a translation and 7 of a rotation")
             instances.append(_Placed(scope, options["NAME"], np.array((*shift, 0.0, 0.0, 0.0)[:3]), tuple(turn)))
         elif keyword in ("END PART", "END INSTANCE"):
             scope = whole
@@ -167,21 +165,21 @@ def _placed(file: Path) -> list[_Placed]:
             try:
                 _define(scope, keyword, options, rows)
             except KeyError as error:
-                raise ValueError(f"*{keyword}: has no {error.args[0]}, must have one") from None
+                raise ValueError(f"*{keyword}: option {error.args[0]} is missing, must be given") from None
     return [_Placed(whole), *(instances or [_Placed(part, part.name) for part in parts.values()])]
 
 
 def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str]) -> None:
-    """Add nodes, elements, sets or surfaces of a keyword to a scope; other keywords are ignored."""
+    """Add the nodes, elements, sets or surfaces of one keyword to a scope.  Other keywords are ignored."""
     if keyword == "NODE" and rows:
         if options.get("SYSTEM", "R").upper() != "R":
             raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: must be in Cartesian coordinates")
-        rows = [row.upper().replace("D", "E") + ",0,0,0" for row in rows]  # Fortran's exponents
+        rows = [row.upper().replace("D", "E") + ",0,0,0" for row in rows]  # exponents as in Fortran, 1D3
         x = np.array([[float(v.strip() or 0) for v in row.split(",")[:4]] for row in rows])
         scope.nodes.append((x[:, 0].astype(np.int64), x[:, 1:]))
     elif keyword == "ELEMENT" and rows:
         if not (kind := _kind(options["TYPE"])):
-            rows = []  # elements without cells
+            rows = []  # elements without volume or area
         if not rows and "ELSET" in options:
             scope.entry(options, "", np.empty(0, np.int64))
         if not rows:
@@ -190,10 +188,10 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
         width = 1 + _nodes(kind)
         if len(numbers) % width:
             raise ValueError(
-                f"*ELEMENT, TYPE={options['TYPE']}: {len(numbers)} numbers, must be {width} of each element"
+                f"*ELEMENT, TYPE={options['TYPE']}: {len(numbers)} numbers, must be {width} for each element"
             )
         table = numbers.reshape(-1, width)
-        nodes = table[:, [1, 3, 2]] if kind == "line3" else table[:, 1:]  # Abaqus' second node is the middle one
+        nodes = table[:, [1, 3, 2]] if kind == "line3" else table[:, 1:]  # the second node is the middle in Abaqus
         scope.cells.append((kind, table[:, 0], nodes))
         if "ELSET" in options:
             scope.entry(options, "", table[:, 0])
@@ -215,7 +213,7 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
 
 
 def _kind(name: str) -> str:
-    """Return meshio's name of an element type, "" for elements without volume or area."""
+    """Return meshio's name of an element type, or "" for elements without volume or area."""
     name = name.upper()
     if name.startswith(NO_CELL):
         return ""
@@ -226,16 +224,16 @@ def _kind(name: str) -> str:
             return KINDS[what, int(found[1])]
     if found := LINE.match(name):
         return KINDS["line", int(found[1] or {"1": 2, "2": 3, "3": 2}[found[2]])]
-    raise ValueError(f"*ELEMENT, TYPE={name}: must be of a plane or solid body, such as CPE4P, CAX4, C3D8P")
+    raise ValueError(f"*ELEMENT, TYPE={name}: must be an element of a plane or solid body, such as CPE4P, CAX4, C3D8P")
 
 
 def _nodes(kind: str) -> int:
-    """Return the number of nodes of a kind."""
+    """Return the number of nodes of a cell type."""
     return next(of for (_, of), found in KINDS.items() if found == kind)
 
 
 def _assembled(placed: list[_Placed]) -> meshio.Mesh:
-    """Return all placed scopes as one mesh."""
+    """Return the cells of all parts or instances as one mesh."""
     x = [np.empty((0, 3))]
     cells = []
     numbers = []
@@ -247,7 +245,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
             at = np.minimum(np.searchsorted(known, rows), max(0, len(known) - 1))
             missing = rows[known[at] != rows] if len(known) else rows
             if missing.size:
-                raise ValueError(f"*ELEMENT: node {missing.flat[0]} is undefined, must be one of *NODE")
+                raise ValueError(f"*ELEMENT: node {missing.flat[0]} is undefined, must be a number given under *NODE")
             cells.append((kind, start + where[at]))
             numbers.append((k, number))
         _unique([number for of, number in numbers if of == k], "element")
@@ -262,9 +260,9 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
 def _unique(
     numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return node or element numbers in ascending order, and the permutation.
+    """Return node or element numbers in ascending order, and the permutation that sorts them.
 
-    ValueError for a repeated number; repeated nodes must differ in position x (n, 3), m.
+    Raise ValueError for a repeated number.  A node may be repeated at the same position x (n, 3), m.
     """
     numbers = np.concatenate([np.empty(0, np.int64), *numbers])
     order = np.argsort(numbers, kind="stable")
@@ -278,7 +276,7 @@ def _unique(
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return element sets and surfaces by name; facets of surfaces are appended to the cells."""
+    """Return the cells of element sets and surfaces by name.  Facets of surfaces are appended to `cells`."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [
         [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed
@@ -305,27 +303,27 @@ def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list
 def _members(
     placed: list[_Placed], k: int, key: str, above: tuple[str, ...] = ()
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return the element numbers of a set, each with the index of its placed scope."""
+    """Return the element numbers of a set, each array with the index of its instance or part in `placed`."""
     out = []
     if key not in placed[k].scope.sets or key in above:
         known = ", ".join(found.name for found in placed[k].scope.sets.values()) or "none"
-        raise ValueError(f"set {key!r} of elements, must be one of {placed[k].name or 'the file'}: {known}")
+        raise ValueError(f"element set {key!r}, must be a set of {placed[k].name or 'the file'}: {known}")
     for instance, rows in placed[k].scope.sets[key].entries:
         at = next((i for i, one in enumerate(placed) if one.name.upper() == instance), None) if instance else k
         if at is None:
-            raise ValueError(f"set {key!r}: instance {instance!r}, must be one of the file's")
+            raise ValueError(f"set {key!r} refers to instance {instance!r}, must be an instance of the file")
         out += _members(placed, at, rows, (*above, key) if at == k else ()) if isinstance(rows, str) else [(at, rows)]
     return out
 
 
 def _surfaces(placed: list[_Placed], cells: list, numbers: list) -> Iterator[tuple[str, str, NDArray[np.int64]]]:
-    """Return the facets of surfaces: name, kind and nodes; entries without a face number contain all faces."""
+    """Return the facets of surfaces as (name, cell type, nodes).  An entry without a face number means all faces."""
     out: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
     for k, one in enumerate(placed):
         for name, pairs in one.scope.surfaces.values():
             for of, face in pairs:
                 if face and not re.fullmatch(r"[sS]\d", face):
-                    continue  # of shells
+                    continue  # a face of a shell
                 instance, _, key = of.rpartition(".")
                 at = next((i for i, p in enumerate(placed) if instance and p.name.upper() == instance.upper()), k)
                 key = key if at != k else of

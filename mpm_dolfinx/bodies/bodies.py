@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies, seeded with material points."""
+"""Seeded bodies: reference geometry of their particle domains, and the material points seeded in them."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A seeded body: reference geometry of all its particle domains, equal on every process.
+    """A seeded body: reference geometry of all its particle domains, the same on every process.
 
-    material: index in the scene's list; map: map of the corners of the domains' boxes, see `mapped`.  Subclasses define
-    `spacing`, the edges of these boxes, m: (d,) for equal boxes, (n, d) in general, or (d,) with the shortest rows.
-    Arrays over all domains are not cached, so large bodies are processed in chunks.
+    Each domain is the image of a box under `map`, see `mapped`.  Subclasses define `spacing`, the edges of boxes, m:
+    (d,) for boxes of equal size, (n, d) in general, or (d,) with the smallest edges.  Arrays over all domains are not
+    stored, so that large bodies can be processed in chunks.
     """
 
-    material: int = 0
-    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    material: int = 0  # index in the scene's list of materials
+    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None  # of the boxes' corners
 
     def __len__(self) -> int:
         raise NotImplementedError
 
     @property
     def dim(self) -> int:
-        """Number d of coordinates."""
+        """Number d of dimensions."""
         raise NotImplementedError
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of domains."""
+        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
         raise NotImplementedError
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
         raise NotImplementedError
 
     @property
@@ -52,7 +52,7 @@ class Body:
 
     @property
     def sides(self) -> NDArray[np.bool_]:
-        """Whether faces (n, d, 2) of all domains lie on the surface of the body."""
+        """Whether the faces (n, d, 2) of all domains lie on the surface of the body."""
         return self.sides_of(slice(None))
 
     @property
@@ -61,12 +61,12 @@ class Body:
         return self.centre_of(slice(None))
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of domains."""
+        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.spacing
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box before the map."""
+        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
         low, high = np.full((2, self.dim), [[np.inf], [-np.inf]])
         for part in in_chunks(len(self)):
             lower = self.lower_of(part)
@@ -76,7 +76,7 @@ class Body:
 
     @property
     def aligned(self) -> bool:
-        """Whether the domains are boxes along the axes."""
+        """Whether the domains are boxes with edges along the axes."""
         return self.map is None
 
     @property
@@ -85,24 +85,25 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on a side, ascending, and the numbers (m,) of these faces."""
+        """Return the domains (m,) with a face on the side `name`, in ascending order, and their face numbers (m,)."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face towards an end of an axis, and the numbers of these faces.
+        """Return the domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face numbers.
 
-        In unstructured bodies the largest component of the unit normal points there, and exceeds `least`.
+        In unstructured bodies: surface faces whose outward unit normal has its largest component along this direction.
+        The component must exceed `least`.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), ascending, with the face at an end of an axis on the surface."""
+        """Return the domains (m,), in ascending order, whose face at an end of an axis lies on the surface."""
         rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains across an axis, and their mean edge, m."""
+        """Return the mean number of domains along an axis, and their mean edge length, m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -111,11 +112,11 @@ class Body:
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of domains, before the map."""
+        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
         return self.lower_of(chosen)[:, None] + corner_bits(self.dim) * self.spacing
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the corners (m, 2^d, d), m, of domains, after the map."""
+        """Return the corners (m, 2^d, d), m, of the chosen domains, after the map."""
         return self.images(self.reference(chosen))
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -125,13 +126,13 @@ class Body:
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
-            raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
+            raise ValueError(f"body: the map returns shape {images.shape}, must be one position each, {x.shape}")
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the distances (m,), m, of the domains' edge midpoints from the mapped reference midpoints.
+        """Return the distances (m,), m, between edge midpoints of mapped domains and mapped midpoints of the boxes.
 
-        The straight edges of two domains along the same curve may differ by this distance.
+        Straight edges of two domains along the same curve may differ by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:
@@ -145,7 +146,7 @@ class Body:
         return out
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edges (m, d), m, of the boxes of domains, before the map."""
+        """Return the edge lengths (m, d), m, of the boxes of the chosen domains, before the map."""
         return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
 
     @property
@@ -154,7 +155,7 @@ class Body:
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edges (m, d), m, of boxes with the volumes of the domains."""
+        """Return the edge lengths (m, d), m, of boxes that have the volumes of the domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -163,24 +164,24 @@ class Body:
 
 
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
-    """Bend a body: boxes become quadrilaterals or hexahedra with mapped corners; return the bent body.
+    """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra with mapped corners.
 
     Regions, probes, and X in fields of materials and displacements remain positions before all maps.  Contact, overlap,
-    flatness and loads refer to the mapped shape.  Sides keep their names.
+    loads and the check for flat sides use the mapped shape.  Sides keep their names.
 
     Parameters
     ----------
     grid
         Background grid.
     body
-        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped` (whose own map is applied first).
+        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An earlier map is applied first.
     map
-        Function from positions (n, d), m, to positions (n, d), m, inside the grid; smooth and orientation-preserving.
+        Function from positions (n, d), m, to positions (n, d), m, inside the grid.  Smooth; must preserve orientation.
 
     Raises
     ------
     ValueError
-        The map raises, returns another shape or nan, leaves the grid, or inverts a box.
+        The map raises, returns another shape or nan, leads out of the grid, or inverts a box.
     """
     instance("body: grid", grid, Grid)
     instance("body to bend", body, Body)
@@ -193,18 +194,18 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
         if len(out):
             x = corners.reshape(-1, grid.dim)[out[0]]
             raise ValueError(
-                f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
+                f"body: the map moves a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
             )
         volume = volumes(corners)
         if volume.min() < smallest:
             smallest, where = volume.min(), body.centre_of(part)[volume.argmin()]
     if not smallest > 0:
-        raise ValueError(f"body: the map turns the domain at {where} inside out, must not")
+        raise ValueError(f"body: the map turns the domain at {where} inside out, must preserve orientation")
     return bent
 
 
 def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
-    """Return a body; ValueError if it is not inside the grid.  Mapped bodies were checked before."""
+    """Return the body; raise ValueError if it is not inside the grid.  `mapped` has already checked mapped bodies."""
     count, where = 0, None
     for part in in_chunks(len(body) if body.map is None else 0):
         lower = body.lower_of(part) - grid.base
@@ -220,7 +221,7 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
 
 
 def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the seeded pore pressure (n,), Pa, a number or a function of position, at positions x (n, d), m."""
+    """Return the seeded pore pressure (n,), Pa, at positions x (n, d), m, from a number or a function of position."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
         given = at_places("pressure", allowed, pressure, "x", x)
@@ -231,7 +232,7 @@ def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.
 def material_points(
     grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
 ) -> MaterialPoints:
-    """Return the material points of the bodies on this process, at rest with a pore pressure, see `pressure_at`."""
+    """Return the material points of the bodies on this process, with the pore pressures of `pressure_at`."""
     starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
     rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
     ids = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
@@ -261,11 +262,11 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (m,) with centroids in cells of this process, and their corners (m, 2^d, d), m."""
+    """Return the domains (m,) whose centroids lie in cells of this process, and their corners (m, 2^d, d), m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
-        # the copies of the grid have equal owners
+        # all copies of the grid have the same partition
         own = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
         rows.append(part.start + own)
         corners.append(of_part[own])
@@ -273,7 +274,7 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
 
 
 def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
-    """Return the number of seeded points of bodies in each cell of the grid (cells,)."""
+    """Return the number of seeded points in each cell of the grid (cells,)."""
     out = np.zeros(int(np.prod(grid.shape)))
     for body in bodies:
         for part in in_chunks(len(body)):
@@ -283,7 +284,7 @@ def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
 
 
 def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Raise an error for bodies of another dimension, bodies outside the grid, and repeated bodies."""
+    """Raise an error for bodies of the wrong dimension, bodies outside the grid, and repeated bodies."""
     check_different(bodies)
     for i, body in enumerate(bodies):
         if body.dim != grid.dim:
@@ -292,7 +293,7 @@ def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def check_different(bodies: Sequence[Body]) -> None:
-    """Raise an error for a repeated body, because conditions would count its faces twice but act on one copy."""
+    """Raise an error for a repeated body: conditions would count its faces twice, but act on one copy only."""
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a regular lattice, stored as a few numbers for any size."""
+"""Bodies of boxes on a regular lattice, stored as a few numbers for any number of boxes."""
 
 from __future__ import annotations
 
@@ -20,27 +20,23 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticeBody(Body):
-    """A body of all or some boxes of a lattice.
+    """A body that consists of all or some boxes of a lattice."""
 
-    origin, spacing (d,): lower corner of the lattice and edges of its boxes, m; count: number of boxes along each axis;
-    filled (n,): ascending lexicographic numbers of the boxes of the body; None: all.
-    """
-
-    origin: NDArray[np.float64]
-    spacing: NDArray[np.float64]
-    count: tuple[int, ...]
-    filled: NDArray[np.integer] | None = None
+    origin: NDArray[np.float64]  # lower corner of the lattice (d,), m
+    spacing: NDArray[np.float64]  # edge lengths of the boxes (d,), m
+    count: tuple[int, ...]  # number of boxes along each axis
+    filled: NDArray[np.integer] | None = None  # lexicographic numbers of the body's boxes (n,), ascending; None: all
 
     def __len__(self) -> int:
         return int(np.prod(self.count)) if self.filled is None else len(self.filled)
 
     @property
     def dim(self) -> int:
-        """Number d of coordinates."""
+        """Number d of dimensions."""
         return len(self.count)
 
     def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the indices (m, d) of domains in the lattice."""
+        """Return the lattice indices (m, d) of the chosen domains."""
         if self.filled is not None:
             numbers = self.filled[chosen]
         elif isinstance(chosen, slice):
@@ -50,11 +46,11 @@ class LatticeBody(Body):
         return np.stack(np.unravel_index(numbers, self.count), axis=-1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of domains."""
+        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
         return self.origin + self._index(chosen) * self.spacing
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
         index = self._index(chosen)
         out = np.stack([index == 0, index == np.array(self.count) - 1], axis=-1)
         if self.filled is None:
@@ -67,7 +63,7 @@ class LatticeBody(Body):
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), ascending, with the face at an end of an axis on the surface."""
+        """Return the domains (m,), in ascending order, whose face at an end of an axis lies on the surface."""
         if self.filled is not None:
             return super()._with_face(axis, end)
         along = [np.arange(n) for n in self.count]
@@ -76,7 +72,7 @@ class LatticeBody(Body):
 
     @cached_property
     def _ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Least and largest indices (d,) of the domains."""
+        """Smallest and largest lattice indices (d,) of the domains."""
         if self.filled is None:
             return np.zeros(self.dim, np.int64), np.array(self.count) - 1
         parts = [self._index(part) for part in in_chunks(len(self))]
@@ -84,60 +80,57 @@ class LatticeBody(Body):
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box before the map."""
+        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
         low, high = (self.origin + index * self.spacing for index in self._ends)
         return low, high + self.spacing
 
     @property
     def lattice(self) -> tuple[int, ...]:
-        """Extent of the body in domains along each axis of the lattice; some of these may be empty."""
+        """Number of lattice boxes along each axis within the bounding box of the body; some may not be filled."""
         low, high = self._ends
         return tuple(high - low + 1)
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return lexicographic numbers (m, 2^d) of the corners of domains; shared corners have one number."""
+        """Return node numbers (m, 2^d) of the corners of domains, equal for shared corners, in lexicographic order."""
         corners = (self._index(rows) - self._ends[0])[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths.
+    """A body of boxes on a lattice with rows of different widths; `spacing` (d,) are the narrowest rows, m."""
 
-    rows: boundaries (count + 1,) of the rows along each axis, m; spacing (d,): narrowest rows, m.
-    """
-
-    rows: tuple[NDArray[np.float64], ...]
+    rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the corners (..., d), m, of the lattice by their indices (..., d)."""
+        """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of domains."""
+        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
         return self._at(self._index(chosen))
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edges (m, d), m, of the boxes of domains, before the map."""
+        """Return the edge lengths (m, d), m, of the boxes of the chosen domains, before the map."""
         index = self._index(chosen)
         return self._at(index + 1) - self._at(index)
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of domains."""
+        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of domains, before the map."""
+        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains across an axis, and their mean edge, m."""
+        """Return the mean number of domains along an axis, and their mean edge length, m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box before the map."""
+        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
         low, high = self._ends
         return self._at(low), self._at(high + 1)
 
@@ -147,13 +140,13 @@ class RowsBody(LatticeBody):
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
-        """Return the coordinates (n,), m, of the rows' boundaries along an axis, within the body."""
+        """Return the coordinates (n,), m, of the boundaries of the rows that the body occupies along an axis."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return the boundaries of rows from low to high, m: `per_cell` rows a cell, and a share of it in cut cells."""
+    """Return boundaries of rows from low to high, m: `per_cell` rows in a whole cell, fewer in a part of a cell."""
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
@@ -164,30 +157,30 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
-    """Return a body on a lattice of rows."""
+    """Return a body on the lattice with these boundaries of rows along each axis, m."""
     narrowest, count = np.array([np.diff(r).min() for r in rows]), tuple(len(r) - 1 for r in rows)
     return RowsBody(origin=np.array([r[0] for r in rows]), spacing=narrowest, count=count, rows=tuple(rows), **more)
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
-    """Seed the box [lower, upper] with a lattice of points that fills it exactly; return the body.
+    """Seed the box [lower, upper] with a lattice of points whose domains fill it exactly; return the body.
 
     Parameters
     ----------
     grid
         Background grid.
     lower, upper : (d,), m
-        Corners of the box, inside the grid; they need not lie on grid lines.
+        Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
-        Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, rows of points end at
-        grid lines.  A value of 1 makes thin bodies too flexible (with a warning), and errors ten times as large as 2.
+        Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
+        lines.  With 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.
     material
         Index of the material in the scene's list, >= 0.
 
     Raises
     ------
     ValueError
-        A corner outside the grid, upper not above lower, or invalid per_cell or material.
+        A corner outside the grid, `upper` not above `lower`, or an invalid `per_cell` or `material`.
     """
     instance("body: grid", grid, Grid)
     lower, upper = (
@@ -208,9 +201,9 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed the points of the grid's own lattice with centres inside a shape; return the body.
+    """Seed a body with the domains of a lattice over the whole grid whose centres lie inside a shape; return the body.
 
-    Its surface consists of steps of the size of a domain; `mapped` gives smooth sides.
+    The surface of the body has steps of the size of a domain.  `mapped` gives smooth sides.
 
     Parameters
     ----------
@@ -226,13 +219,13 @@ def shape(
     Raises
     ------
     ValueError
-        `inside` raises, returns no booleans or is False everywhere; or invalid per_cell or material.
+        `inside` raises, returns no booleans or is False everywhere; `per_cell` or `material` is invalid.
     """
     instance("body: grid", grid, Grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
     count = grid.shape * per_cell
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
-    allowed = f"one bool a position, ({len(index)},)"
+    allowed = f"one bool for each position, ({len(index)},)"
     if grid.even:
         spacing = grid.h / per_cell
         x = grid.lower + (index + 0.5) * spacing
@@ -243,7 +236,9 @@ def shape(
     if filled.shape != (len(index),) or filled.dtype != bool:  # such as a signed distance
         raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     if not filled.any():
-        raise ValueError("body: inside(x) is False at all points, must be True at one: is it below a cell in size?")
+        raise ValueError(
+            "body: inside(x) is False at all points, must be True at one: is the shape smaller than a cell?"
+        )
     numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
     if not grid.even:
         return check_inside(grid, _lattice(rows, filled=numbers_of, material=material))

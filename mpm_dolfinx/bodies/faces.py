@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Surface of the bodies: faces on sides, without parts in contact with other bodies, limited to regions."""
+"""Surface of the bodies: faces on a side or in a region, without parts that touch other bodies."""
 
 from __future__ import annotations
 
@@ -35,28 +35,25 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Faces of domains on one side of the bodies, equal on every process; arrays over m rows.
+    """Faces of particle domains on one side of the bodies, the same on every process; arrays over m rows.
 
-    A face with several free parts has a row for each part.
-
-    id: (m,) number of the point, ascending; face: (m,) number of the face in its domain, see `cutting.FACES`; xi:
-    (m, 2^(d-1), d) corners of the free part in the local coordinates of the domain, in [-1, 1], a triangle repeats its
-    last one; domain, before: (m, 2^d, d) seeded corners of the domain after all maps, and before them (reference
-    positions), m; region: (2, d) box of reference positions that limits the faces, m.
+    The free part of a face is the part that touches no other body.  It is divided into polygons of up to four corners;
+    each polygon has a row.
     """
 
-    id: NDArray[np.int64]
-    face: NDArray[np.int64]
+    id: NDArray[np.int64]  # number of the material point (m,), ascending
+    face: NDArray[np.int64]  # number of the face in its domain (m,), see `cutting.FACES`
+    # corners of the free part in local coordinates of the domain in [-1, 1] (m, 2^(d-1), d); triangles repeat the last
     xi: NDArray[np.float64]
-    domain: NDArray[np.float64]
-    before: NDArray[np.float64]
-    region: NDArray[np.float64]
+    domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
+    before: NDArray[np.float64]  # reference positions of these corners, before all maps (m, 2^d, d), m
+    region: NDArray[np.float64]  # box of reference positions that limits the faces (2, d), m
 
     def __len__(self) -> int:
         return len(self.id)
 
     def off_axis(self) -> Surface:
-        """Return the faces without faces on the axis of revolution, which have no area."""
+        """Return the surface without faces that lie on the axis of revolution, which have no area."""
         off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self
@@ -65,17 +62,17 @@ class Surface:
 
     @cached_property
     def outward(self) -> NDArray[np.float64]:
-        """Seeded outward area vectors (m, d) of whole faces, m^(d-1)."""
+        """Seeded outward area vectors (m, d), m^(d-1), of the whole faces."""
         return face_vectors(self.domain, self.face)
 
     @cached_property
     def whole0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,) of whole faces, m^(d-1)."""
+        """Seeded areas (m,), m^(d-1), of the whole faces."""
         return np.linalg.norm(self.outward, axis=1)
 
     @cached_property
     def area0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,) of the free parts, m^(d-1)."""
+        """Seeded areas (m,), m^(d-1), of the free parts."""
         x = self.places()
         if x.shape[2] == 2:
             return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
@@ -83,7 +80,7 @@ class Surface:
 
     @cached_property
     def skew(self) -> NDArray[np.bool_]:
-        """Which seeded faces (m,) are not parallelograms."""
+        """Whether the seeded faces (m,) are no parallelograms."""
         x = np.take_along_axis(self.domain, FACES[self.xi.shape[2]][self.face][:, :, None], axis=1)
         off = np.linalg.norm(x[:, -1] - x[:, 1] - x[:, -2] + x[:, 0], axis=1) if x.shape[2] == 3 else np.zeros(len(x))
         return off > SAME * np.ptp(x, axis=1).max(axis=1)
@@ -94,7 +91,7 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), m, of local coordinates xi (n, d) on faces."""
+        """Return the reference positions (n, d), m, at local coordinates xi (n, d) of the faces with indices `at`."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
@@ -105,7 +102,7 @@ class Surface:
 
     @property
     def X(self) -> NDArray[np.float64]:
-        """Bounding boxes (m, 2, d), m, of the free parts in reference positions."""
+        """Bounding boxes (m, 2, d), m, of the reference positions of the free parts."""
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
 
 
@@ -113,9 +110,9 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the corners (2, d) of a region, m; infinite without a region.
+    """Return the lower and upper corner (2, d), m, of a region; infinite if there is no region.
 
-    Equal regions have equal bytes (`tobytes`), which serve as a key.
+    Equal regions give equal bytes (`tobytes`), which serve as a key.
     """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
@@ -127,25 +124,28 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 def surface(
     bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the faces on a side of the present bodies, without parts in contact with other bodies.
+    """Return the faces on a side of the active bodies, without the parts that touch other bodies.
 
-    Contact is that of the seeded bodies, after their maps.  It is permanent, because bodies in contact stick.
+    Contact is determined for the seeded bodies, after their maps.  Contact is permanent, because touching bodies stick.
 
     Parameters
     ----------
     name
         Side: "left", "right", "bottom", "top", in 3D also "front", "back", or a name from a mesh.  None: all sides.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the faces; a face partly inside counts with that part.
+        Box of reference positions.  Faces are limited to their parts inside this box.
     present
-        Which bodies are present, by default all.
+        Which bodies are active; by default all.
     """
     shown = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
     if name is not None and (not isinstance(name, str) or name not in known):
-        raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
+        allowed = f"must be one of {', '.join(known)}" if known else "no body has a named side"
+        raise ValueError(f"side {name!r}: {allowed}")
     box = limits(region, dim)
-    around = [Faces.around(body) if here and sum(shown) > 1 else None for body, here in zip(bodies, shown, strict=True)]
+    around = [
+        Faces.around(body) if visible and sum(shown) > 1 else None for body, visible in zip(bodies, shown, strict=True)
+    ]
     none = np.empty(0, np.int64)
     start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):
@@ -161,7 +161,7 @@ def surface(
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
-    """Return the faces of several surfaces of different bodies as one surface."""
+    """Return the faces of surfaces of different bodies as one surface."""
     names = [f.name for f in fields(Surface) if f.name != "region"]
     rows = {name: np.concatenate([getattr(one, name) for one in surfaces]) for name in names}
     order = np.argsort(rows["id"], kind="stable")
@@ -180,7 +180,7 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # ignores slivers, which would prescribe whole domains
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # else a sliver would prescribe a whole domain
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)
@@ -195,16 +195,16 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return parts t (n, 4, 2) of faces part (n,), limited to a region: their faces (m,), and xi as in `Surface`.
+    """Limit parts of faces to a region; return their faces (m,), and their corners xi as in `Surface`.
 
-    row, face (k,): domains and face numbers of all faces.
+    `row` and `face` (k,) are domains and face numbers.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
     bent = np.zeros(len(X), dtype=bool)
     clipped = np.empty((0, 3, 2))
     of = np.empty(0, np.int64)
-    if dim == 3 and body.lattice is None:  # partial faces that are not rectangles along the axes
+    if dim == 3 and body.lattice is None:  # faces that may cross the region and are no rectangles along the axes
         bent = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1) & ~_along_axes(X)
         clipped, of = _clipped(X[bent], t[bent], region)
     quad, three = np.flatnonzero(~bent & ~three), np.flatnonzero(~bent & three)
@@ -225,20 +225,20 @@ def _limited(
 
 
 def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which faces (n,) with corners (n, 4, 3), m, are rectangles with edges along the axes."""
+    """Return whether faces with corners X (n, 4, 3), m, are rectangles with edges along the axes."""
     edges = X[:, [1, 2, 3, 3]] - X[:, [0, 0, 2, 1]]
     return ((np.abs(edges) > rounding(X)).sum(axis=2) == 1).all(axis=1)
 
 
 def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the intervals (n, 2) of faces in a region, in the coordinates of the faces.
+    """Return the lower and upper bounds (n, 2) of the parts of faces in a region, in the coordinates of the faces.
 
-    X (n, 2^(d-1), d), m: reference corners of edges, or of rectangles along the axes.
+    X (n, 2^(d-1), d), m, are reference corners of edges, or of rectangles with edges along the axes.
     """
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
         edge = X[:, 1 << k] - X[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):  # edges across an axis have no limit along it
+        with np.errstate(divide="ignore", invalid="ignore"):  # edges normal to an axis have no limits along it
             ends = np.where(np.abs(edge) > rounding(X), (region[:, None] - X[:, 0]) / edge, [[[-np.inf]], [[np.inf]]])
         low[:, k] = np.maximum(0.0, ends.min(axis=0).max(axis=1))
         high[:, k] = np.minimum(1.0, ends.max(axis=0).min(axis=1))
@@ -248,9 +248,9 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return parts t (n, 4, 2) of faces X (n, 4, 3), clipped to a region: triangles, and the index of the part."""
+    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region; return triangles, and the index of the part of each."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
-    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # triangles use a corner as their middle
+    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, a corner serves as the middle
     middle = np.where(three, places[:, 2], places.mean(axis=1))
     places = np.concatenate([places, middle[:, None]], axis=1)
     s = np.concatenate([places[:, list(triangle)].transpose(1, 2, 0) for triangle in ABOUT_MIDDLE], axis=2)
@@ -264,9 +264,10 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces: the face (n,) of each, and its corners (n, 4, 2) in [0, 1] over the face.
+    """Return the free parts of faces: the face (n,) of each part, and its corners (n, 4, 2) in face coordinates [0, 1].
 
-    Parts are rectangles if covering boxes lie along the edges of the face, else triangles with a repeated last corner.
+    A part is a rectangle if all boxes that cover its face lie along the edges of the face.  Otherwise it is a triangle
+    with a repeated last corner.
     """
     on = [covers(own, other) for other in others]
     if not on:
@@ -283,7 +284,7 @@ def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArr
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions (m, d) in domains (m, 2^d, d) at local coordinates (m, d) in [-1, 1]."""
+    """Return the positions (m, d) at local coordinates xi (m, d) in [-1, 1] of domains with corners (m, 2^d, d)."""
     signs = 2 * corner_bits(xi.shape[1]) - 1
     N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
     return np.einsum("mk,mkd->md", N, corners)
@@ -292,7 +293,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return coordinates xi (n, 3) in domains (n, 8, 3), moved along faces (n,) to positions x (n, 3) on them."""
+    """Return local coordinates xi (n, 3) of domains (n, 8, 3) after a move along faces (n,) to positions x (n, 3)."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Placement of bodies that are added later onto the present surface of their seeded neighbours."""
+"""Placement of bodies that are added in a later stage (fills) onto the displaced surface of their neighbours."""
 
 from __future__ import annotations
 
@@ -22,24 +22,20 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-MISFIT = 0.01  # cells: distance of a fill's straight edges from a bent surface above which a warning is issued
-UPRIGHT = 0.95  # cosine: faces of a mesh opposite to the contact, up to this angle, keep their seeded place
+MISFIT = 0.01  # cells: a fill's straight edges may be this far from a bent surface before a warning is given
+UPRIGHT = 0.95  # cosine of the largest angle between mesh faces and the side opposite to the contact
 INSIDE = 0.05  # of a domain's shortest edge: deeper penetration into a fill is an error
 
 
 @dataclass
 class Contact:
-    """Seeded contact between a side of a fill and a body; n pairs of faces.
+    """Contact between a side of a seeded fill and a body; n pairs of faces."""
 
-    side: (axis, end) of the fill; own, other: faces of both; cover: pairs of faces in contact; moved (n, 4, d):
-    displacement of the corners of the body's faces since seeding, m.
-    """
-
-    side: tuple[int, int]
-    own: Faces
-    other: Faces
-    cover: Cover
-    moved: NDArray[np.float64]
+    side: tuple[int, int]  # (axis, end) of the fill
+    own: Faces  # faces of the fill on this side
+    other: Faces  # surface faces of the body
+    cover: Cover  # pairs of these faces in contact
+    moved: NDArray[np.float64]  # displacement since seeding of the corners of the body's faces (n, 4, d), m
 
     def area(self) -> float:
         """Return the contact area, m^(d-1)."""
@@ -51,14 +47,14 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill's faces lie on the paired face, and its displacement (n, 4, d)."""
+        """Return which corners (n, 4) of the fill lie on the paired face, and its displacements there (n, 4, d), m."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return the largest distance, m, of the body's corners from the fill, if the fill's corners move by u."""
+        """Return the largest distance, m, between the body's corners and the fill, whose corners have moved by u."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -66,7 +62,7 @@ class Contact:
 
 
 def touches(bodies: Sequence[Body], others: Sequence[int], fill: int) -> bool:
-    """Return whether a seeded fill touches one of the present bodies."""
+    """Return whether a seeded fill touches one of the bodies `others`."""
     own = Faces.around(bodies[fill])
     return any(len(covers(own, Faces.around(bodies[other])).face) for other in others)
 
@@ -74,22 +70,23 @@ def touches(bodies: Sequence[Body], others: Sequence[int], fill: int) -> bool:
 def put(
     grid: Grid, bodies: Sequence[Body], others: Sequence[int], fill: int, points: MaterialPoints, new: MaterialPoints
 ) -> MaterialPoints:
-    """Return the points of a fill, placed onto the present bodies.
+    """Return the material points of a fill, placed onto the active bodies.
 
-    Sides in seeded contact follow the neighbours.  The side opposite to the largest contact keeps its seeded place.
-    The interior is interpolated.  The fill is at rest, and its domains have the volumes of this shape.
+    Sides of the fill that touch a neighbour as seeded follow the neighbour's displacement.  The side opposite to the
+    largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero velocity;
+    its domains have the volumes of the displaced shape.
 
     Parameters
     ----------
     bodies, others, fill
-        All bodies, indices of the present ones, and index of the fill.
+        All bodies, indices of the active bodies, and index of the fill.
     points, new
-        Points of the present bodies, and of the seeded fill, on this process.
+        Points of the active bodies, and points of the fill as seeded, on this process.
 
     Raises
     ------
     ValueError
-        A present body has moved into the fill; with place and depth.
+        An active body has moved into the fill.  The message gives place and depth.
     """
     body = bodies[fill]
     corners = bodies[fill].corners() - grid.base
@@ -102,13 +99,13 @@ def put(
         _check_shape(grid, fill, body, corners, u)
         corners = corners + u
     if misfit > MISFIT * grid.least:
-        what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
+        what = "stage: add: body %d: its straight edges are up to %.2g m off the surface on which it is placed"
         warn(grid.comm, ResolutionWarning, what + "; seed it with the spacing of the body below", fill, misfit)
     for other, touching in found.items():
         depth, gap, x = _penetration(grid, bodies, other, corners, points, misfit)
         if depth:
             what = f"stage: add: body {fill}: body {other} has moved into it by {depth:.3g} m at {x + grid.base}"
-            raise ValueError(f"{what}; must be seeded in space that is free now")
+            raise ValueError(f"{what}; must be seeded in space where no body is now")
         together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
         if together and not touching:
             warn_near(grid, f"bodies {other} and {fill}", gap, x + grid.base)
@@ -120,7 +117,7 @@ def put(
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:
-    """Return the number of the first point of a body."""
+    """Return the number of the first material point of a body."""
     return sum(len(b) for b in bodies[:body])
 
 
@@ -134,8 +131,8 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
             if len(cover.face):
                 rows, pair = np.unique(around.row[cover.by], return_inverse=True)
                 now = np.zeros((len(rows), 2**grid.dim, grid.dim))
-                here, at = points.find(_start(bodies, other) + rows)
-                now[here] = points.corners[at]
+                known, at = points.find(_start(bodies, other) + rows)
+                now[known] = points.corners[at]
                 moved = over_all(grid.comm, now) - (bodies[other].corners(rows) - grid.base)
                 moved = moved[pair[:, None], around.index[cover.by]]
                 out.append(Contact((axis, end), own, around, cover, moved))
@@ -143,7 +140,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Return the displacements (n, 2^d, d), m, of the corners of a fill that follows its neighbours."""
+    """Return the displacements (n, 2^d, d), m, of the corners of a fill whose touching sides follow the neighbours."""
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
@@ -162,7 +159,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # slides along walls
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # normal to walls of the grid
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))
@@ -180,14 +177,14 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements (n,) along an axis: the fixed ones, and the others in equilibrium with them."""
+    """Return the displacements (n,) along an axis: u where fixed; the other nodes are in equilibrium with these."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
         rows = K[free]
         A = rows[:, free].tocsr()
         csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
-        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # all processes hold all seeded bodies
+        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # every process holds all seeded bodies
         solver = PETSc.KSP().create(MPI.COMM_SELF)
         solver.setErrorIfNotConverged(True)
         solver.setOperators(matrix)
@@ -204,7 +201,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
 
 
 def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray) -> None:
-    """Raise an error if a domain of the fill has nearly no volume, or leaves the grid."""
+    """Raise an error if a displaced domain of the fill loses nearly all its volume, or leaves the grid."""
     now = corners + u
     ratio = volumes(now) / volumes(corners)
     k = int(np.argmin(ratio))
@@ -212,19 +209,22 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
     name = f"stage: add: body {fill}: its seeded neighbour has moved by up to {far:.3g} m"
     if ratio[k] < TANGLED:
         raise ValueError(
-            f"{name}; its domain at {corners[k].mean(axis=0) + grid.base} keeps {ratio[k]:.2g} of the volume, "
+            f"{name}; the domain at {corners[k].mean(axis=0) + grid.base} keeps {ratio[k]:.2g} of its volume, "
             f"must keep {TANGLED}"
         )
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):
         x = now.reshape(-1, grid.dim)[out[0]] + grid.base
-        raise ValueError(f"{name}; following it, it has a corner at {x}, must be inside {grid.lower} to {grid.upper}")
+        raise ValueError(f"{name}; a corner that follows reaches {x}, must be inside {grid.lower} to {grid.upper}")
 
 
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the penetration of a body into a fill's domains, m, their gap in cells, and the place."""
+    """Return the penetration depth of a body into the fill's domains, m, the gap in cells, and the position (d,), m.
+
+    Depth or gap is zero.
+    """
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]

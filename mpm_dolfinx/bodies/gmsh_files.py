@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Reader of gmsh files of format 4.1 as meshio meshes, with all physical groups of each entity.
+"""Reader of gmsh files of format 4.1: a meshio mesh with all physical groups of each entity.
 
-meshio's own reader keeps only the first group of an entity, and fails for files with ungrouped entities.
+meshio's reader keeps only the first group of an entity, and fails for entities without a group.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""meshio's names of gmsh's element types, and numbers of nodes; second-order types have gmsh's order of edge nodes."""
+"""meshio's name and number of nodes of each gmsh element type.  Edge nodes of second order keep gmsh's order."""
 
 
 class _Numbers:
@@ -36,7 +36,7 @@ class _Numbers:
         self._bytes, self._words = BytesIO(section), iter(() if binary else section.split())
 
     def take(self, count: int, kind: str = "i") -> NDArray:
-        """Return the next numbers (count,): "i" int, "u" size_t, "d" double."""
+        """Return the next `count` numbers of a type: "i" int, "u" size_t, "d" double."""
         dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
             return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)
@@ -44,7 +44,7 @@ class _Numbers:
 
 
 def version(file: Path) -> str:
-    """Return the version of gmsh's format of a file, "" for other files."""
+    """Return the version of the gmsh format of a file, or "" for other files."""
     if not file.is_file():
         return ""
     with file.open("rb") as opened:
@@ -53,24 +53,24 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1; physical groups become cell sets by number, their names field data."""
+    """Return the mesh of a file of format 4.1.  Cell sets are physical groups by number; field data are their names."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"
     if binary and b"\n\x01\0\0\0" not in _section(data, "MeshFormat"):
-        raise ValueError("another byte order, must be that of this machine")
+        raise ValueError("binary file of another byte order, must be that of this machine")
     if binary and size != b"8":
-        raise ValueError(f"numbers of {size.decode()} bytes, must be of 8")
+        raise ValueError(f"binary file with numbers of {size.decode()} bytes, must be of 8")
     groups = dict(_groups(_Numbers(_section(data, "Entities"), binary))) if b"$Entities" in data else {}
     if b"$PartitionedEntities" in data:
-        raise ValueError("a mesh in partitions, must be whole: gmsh writes it so by Mesh.PartitionCreateTopology = 0")
+        raise ValueError("partitioned mesh, must be whole: gmsh writes it with Mesh.PartitionCreateTopology = 0")
     numbers, x = _nodes(_Numbers(_section(data, "Nodes"), binary))
     order = np.argsort(numbers)
     cells, of = [], []
     for dim, entity, name, rows in _elements(_Numbers(_section(data, "Elements"), binary)):
         at = np.minimum(np.searchsorted(numbers[order], rows), len(order) - 1)
         if (numbers[order][at] != rows).any():
-            raise ValueError(f"an element of the node {rows[numbers[order][at] != rows][0]}, must be one of the nodes")
+            raise ValueError(f"an element has node {rows[numbers[order][at] != rows][0]}, must be a node of the file")
         cells.append((name, order[at]))
         of.append(groups.get((dim, entity), []))
     tags = sorted({tag for found in of for tag in found})
@@ -87,12 +87,12 @@ def _section(data: bytes, name: str) -> bytes:
     """Return the content of a section."""
     found = re.search(rb"\$%b[ \r]*\n(.*?)\s?\$End%b" % (name.encode(), name.encode()), data, re.DOTALL)
     if not found:
-        raise ValueError(f"no ${name}, must have it")
+        raise ValueError(f"section ${name} is missing, must be in the file")
     return found[1]
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return the numbers and dimensions (k, 2) of physical groups by name."""
+    """Return the (number, dimension) pairs (k, 2) of the physical groups by name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -102,7 +102,7 @@ def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
 
 
 def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
-    """Yield (dimension, number) of each entity with the numbers of its physical groups."""
+    """Yield (dimension, number) of each entity, and the numbers of its physical groups."""
     for dim, count in enumerate(numbers.take(4, "u")):
         for _ in range(count):
             (tag,) = numbers.take(1)
@@ -115,7 +115,7 @@ def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
 
 
 def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the numbers (n,) of nodes and their positions (n, 3), m."""
+    """Return the numbers (n,) and positions (n, 3), m, of the nodes."""
     tags, x = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for _ in range(numbers.take(4, "u")[0]):
         dim, _, parametric = numbers.take(3)
@@ -127,7 +127,7 @@ def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int64]]]:
-    """Yield dimension and number of each entity with the kind and nodes (n, k) of its elements."""
+    """Yield the dimension and number of each entity, and the cell type and nodes (n, k) of its elements."""
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:

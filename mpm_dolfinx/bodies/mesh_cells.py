@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Cell types of meshes: their facets, and their division into particle domains.
 
-A triangle is divided into three quadrilaterals, a tetrahedron into four hexahedra with plane faces.  There is one
-domain for each vertex, with corners at the means of the vertex and some others.  A wedge is divided like its triangle;
-a pyramid is two tetrahedra.  Neighbouring cells of any types divide a common facet alike, except for a quadrilateral of
-a hexahedron, which stays whole.
+A triangle is divided into three quadrilaterals, a tetrahedron into four hexahedra with plane faces: one domain for each
+vertex.  Each corner of this domain is the mean of the vertex and none, some or all of the others.  A wedge is divided
+like its triangle; a pyramid consists of two tetrahedra.  Neighbouring cells divide their common facet in the same way.
+The exception is a quadrilateral facet of a hexahedron, which is not divided.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.points.cutting import FACES, corner_bits
 
 KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
-"""Cell types that become domains, and their numbers of vertices."""
+"""Types of cells that become particle domains, and their numbers of vertices."""
 SIDES_OF = {2: {"line": 2}, 3: {"triangle": 3, "quad": 4}}
-"""Cell types of sides."""
+"""Types of the facets that form sides, and their numbers of vertices."""
 AS_LATTICE = {"quad": [0, 1, 3, 2], "hexahedron": [0, 1, 3, 2, 4, 5, 7, 6]}
-"""Order of meshio's vertices with the first axis fastest."""
+"""Indices that sort meshio's vertices so that the first axis varies fastest."""
 SECOND_ORDER = {
     **{"line3": "line", "triangle6": "triangle", "triangle7": "triangle", "quad8": "quad", "quad9": "quad"},
     **{"tetra10": "tetra", "hexahedron20": "hexahedron", "hexahedron24": "hexahedron", "hexahedron27": "hexahedron"},
     **{"wedge12": "wedge", "wedge15": "wedge", "wedge18": "wedge", "pyramid13": "pyramid", "pyramid14": "pyramid"},
 }
-"""Second-order cell types, which list vertices first, and the matching first-order types."""
+"""First-order type of each second-order cell type.  Second-order cells list their vertices first."""
 LOOPS = {
     "triangle": [(0, 1), (1, 2), (2, 0)],
     "quad": [(0, 1), (1, 3), (3, 2), (2, 0)],
@@ -38,26 +38,26 @@ LOOPS = {
     "wedge": [(0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)],
     "pyramid": [(0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)],
 }
-"""Vertices around each facet of a cell type; quadrilaterals and hexahedra with the first axis fastest."""
+"""Vertices around each facet of a cell type.  In quadrilaterals and hexahedra the first axis varies fastest."""
 
 
 class Block(NamedTuple):
-    """Cells of one type; meshio's own blocks lack some second-order types."""
+    """Cells of one type.  meshio's own class lacks some second-order types."""
 
     type: str
     data: NDArray[np.int64]
 
 
 def edges(kind: str) -> list[tuple[int, int]]:
-    """Return the vertices of the edges of a cell type, each once, in the numbering of `LOOPS`."""
+    """Return the pairs of vertices of the edges of a cell type, numbered as in `LOOPS`, without repetition."""
     around = [pair for loop in LOOPS[kind] for pair in zip(loop, (*loop[1:], loop[0]), strict=True)]
     return sorted({tuple(sorted(pair)) for pair in around})
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index of each distinct row (n, k), in sorted order, and the distinct row of each row (n,).
+    """Return the first index of each distinct row of an array (n, k), and the index of the distinct row (n,).
 
-    This is five times faster than numpy's unique, which compares rows as objects.
+    Distinct rows are sorted.  `np.unique` compares rows as objects and takes five times as long.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
@@ -68,14 +68,10 @@ def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 
 @dataclass(frozen=True)
 class Part:
-    """A domain that is a part of a cell.
+    """A particle domain that is a part of a mesh cell."""
 
-    corners (2^d,): the vertices whose mean is each corner; faces (2d,): the vertices of the facet that contains each
-    face, empty for a face inside the cell.
-    """
-
-    corners: tuple[tuple[int, ...], ...]
-    faces: tuple[tuple[int, ...], ...]
+    corners: tuple[tuple[int, ...], ...]  # (2^d,): each corner is the mean of these vertices
+    faces: tuple[tuple[int, ...], ...]  # (2d,): vertices of the facet that contains the face; () inside the cell
 
 
 def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
@@ -95,7 +91,7 @@ def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
 
 
 def _wedge() -> list[Part]:
-    """Return the parts of a wedge: the parts of its triangle, extruded."""
+    """Return the parts of a wedge, which are the extruded parts of its triangle."""
     out, quads = [], LOOPS["wedge"][2:]
     for part in _of_simplices("triangle", (0, 1, 2)):
         corners = [tuple(v + end for v in of) for end in (0, 3) for of in part.corners]
@@ -105,7 +101,7 @@ def _wedge() -> list[Part]:
 
 
 def _whole(dim: int) -> list[Part]:
-    """Return the one part of a quadrilateral or hexahedron."""
+    """Return the only part of a quadrilateral or hexahedron, which is the whole cell."""
     return [Part(tuple((k,) for k in range(2**dim)), tuple(map(tuple, FACES[dim].tolist())))]
 
 
@@ -121,20 +117,16 @@ PARTS = {
 
 @dataclass(frozen=True, eq=False)
 class Polytopes:
-    """Cells of all types as convex polytopes; arrays over n cells.
+    """Convex mesh cells of any types; arrays over n cells."""
 
-    x (n, k, d): vertices, m, padded by the last one; normals (n, f, d): of facets, padded by zeros; edges (n, e, d): m,
-    padded by zeros; warp (n,): distance of facet vertices from a plane, m.
-    """
-
-    x: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    edges: NDArray[np.float64]
-    warp: NDArray[np.float64]
+    x: NDArray[np.float64]  # vertices (n, k, d), m, padded by repeating the last one
+    normals: NDArray[np.float64]  # normals of facets (n, f, d), padded by zeros
+    edges: NDArray[np.float64]  # edge vectors (n, e, d), m, padded by zeros
+    warp: NDArray[np.float64]  # distance of facet vertices from the mean plane of the facet (n,), m
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return the polytopes of all cells, type by type; x (nodes, d): positions, m; cells: type -> nodes (n, k)."""
+        """Return all cells as polytopes, from positions x (nodes, d), m, and the nodes (n, k) of each cell type."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
@@ -143,10 +135,10 @@ class Polytopes:
     def overlaps(
         self, i: NDArray[np.int64], j: NDArray[np.int64], slack: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return which pairs (m,) of cells i, j overlap, and by how much, m.
+        """Return which pairs (m,) of cells i, j overlap, and the depth of the overlap of each, m.
 
-        Convex cells overlap if no plane separates them.  Normals of their facets and, in 3D, cross products of their
-        edges are sufficient candidates.  Overlaps below `slack` (m,), m, are ignored.
+        Two convex cells overlap if no plane separates them.  It is sufficient to try planes normal to the facet normals
+        and, in 3D, to the cross products of edges.  An overlap shallower than `slack` (m,), m, is ignored.
         """
         left, depth = np.arange(len(i)), np.full(len(i), np.inf)
         for normals in self._planes():
@@ -163,7 +155,7 @@ class Polytopes:
         return left, depth[left]
 
     def _planes(self):
-        """Yield functions that return normals (m, d) of candidate planes for pairs of cells."""
+        """Yield functions that return the normals (m, d) of planes that may separate pairs of cells."""
         for f in range(self.normals.shape[1]):
             yield lambda i, j, f=f: self.normals[i, f]
             yield lambda i, j, f=f: self.normals[j, f]
@@ -174,7 +166,7 @@ class Polytopes:
 
 
 def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products (n, 3) of edges, zero for edges that are parallel within rounding."""
+    """Return the cross products (n, 3) of edges; zero for edges that are parallel within rounding."""
     out = np.cross(a, b)
     size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.where((np.linalg.norm(out, axis=1) > SAME * size)[:, None], out, 0.0)
@@ -186,7 +178,7 @@ def _shape(kind: str) -> tuple[range, list, list]:
 
 
 def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return the arrays of `Polytopes` for cells of one type with corners x (n, k, d), padded to these numbers."""
+    """Return the arrays of `Polytopes` for vertices x (n, k, d) of one cell type, padded to the given numbers."""
     _, loops, ends = _shape(kind)
     corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
     normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))

@@ -30,9 +30,9 @@ from mpm_dolfinx.points.cutting import FACES
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
 TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_markers", "CellEntityIds")
-"""Names of meshio's cell data that number parts and sides."""
+"""Names under which meshio stores the numbers of parts and sides in cell data."""
 OF_DOLFINX = {2: {"triangle": 6, "quad": 9}, 3: {"tetra": 10, "hexahedron": 27}}
-"""Cell types of dolfinx that become domains, and their numbers of nodes at second order."""
+"""Cell types of dolfinx that become particle domains, and their numbers of nodes at second order."""
 
 
 def from_mesh(
@@ -46,12 +46,12 @@ def from_mesh(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a body from a mesh, with its cells as particle domains; return the body.
+    """Seed a body from a mesh whose cells become particle domains; return the body.
 
     Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
-    surfaces, or facet tags.  Bodies from several parts of a mesh share their inner faces, which are no surface while
-    both are present.  The mesh has reference positions.  The points form no lattice, so the filter of short
-    waves does not act.
+    surfaces, or facet tags.  Bodies from several parts of a mesh share their inner faces.  These are no surface while
+    both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice, so the filter of
+    short waves does not act.
 
     Parameters
     ----------
@@ -60,16 +60,16 @@ def from_mesh(
     mesh
         A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh: triangles and quadrilaterals in
         2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
-        warning of the distance of nodes from straight edges.  2D cells lie in a plane of equal z.
+        warning that gives the distance of edge nodes from straight edges.  2D cells must lie in a plane of equal z.
     part
-        Name of a group of cells, such as a physical group, an Abaqus part, instance or set, or a number in data such as
-        "MaterialIDs"; by default all cells.
+        Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a number in data
+        such as "MaterialIDs".
     cell_tags, facet_tags
-        Tags of a dolfinx mesh; cell_tags also the name of a file's cell data that number parts and sides.
+        Tags of a dolfinx mesh.  For a file: `cell_tags` is the name of the cell data that number parts and sides.
     names
-        Name -> number of its tag; a tag without a name is named by its number, such as "3".
+        Number of the tag for each name.  A tag without a name is named by its number, such as "3".
     per_cell
-        Desired points per grid cell and direction, >= 1; domains with an edge above 1.5 cells / per_cell are split.
+        Desired points per grid cell and direction, >= 1.  Domains with an edge above 1.5 cells / per_cell are divided.
     material
         Index of the material in the scene's list, >= 0.
 
@@ -97,7 +97,7 @@ def from_mesh(
 
 
 def _file(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file; its error message contains meshio's output."""
+    """Return the mesh of a file.  An error message includes the output of meshio."""
     output = StringIO()
     try:
         with redirect_stdout(output), redirect_stderr(output):
@@ -110,7 +110,7 @@ def _file(file: Path) -> meshio.Mesh:
 
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Return a meshio mesh; tags: name of the cell data that number parts and sides."""
+    """Convert a meshio mesh.  `tags` is the name of the cell data that number parts and sides."""
     mesh_readers.check_systems(mesh)
     dim = grid.dim
     x = _positions(grid.dim, mesh.points)
@@ -127,8 +127,8 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: st
     if curved:
         _warn_curved(grid, name, curved, off)
     if tags is not None and tags not in mesh.cell_data:
-        known = ", ".join(mesh.cell_data) or "none, for its cells have no data"
-        raise ValueError(f"mesh: cell_tags = {line(tags)}, must be one of the mesh's data of cells: {known}")
+        known = ", ".join(mesh.cell_data) or "none, for the cells have no data"
+        raise ValueError(f"mesh: cell_tags = {line(tags)}, must be the name of cell data of the mesh: {known}")
     cells = {kind: [np.empty((0, count), np.int64)] for kind, count in KINDS[dim].items()}
     parts, sides = {}, {}
     for i, (kind, rows) in enumerate(blocks):
@@ -151,20 +151,20 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: st
 
 
 def _positions(dim: int, points: Any) -> NDArray[np.float64]:
-    """Return the vertices (n, 2 or 3), m, of a mesh."""
+    """Return the positions (n, 2 or 3), m, of the vertices of a mesh."""
     x = np.asarray(points, dtype=float)
     if not len(x):
         raise ValueError("mesh: has no vertices, must have cells to fill a body")
     if x.ndim != 2 or not dim <= x.shape[1] <= 3:
-        raise ValueError(f"mesh: its vertices have shape {x.shape}, must have the grid's {dim} coordinates")
+        raise ValueError(f"mesh: vertices of shape {x.shape}, must have the grid's {dim} coordinates")
     return x
 
 
 def _first_order(dim: int, block: Any) -> tuple[str, NDArray[np.int64]]:
-    """Return the first-order type of a block of meshio's cells, and their nodes."""
+    """Return the first-order cell type of a meshio block, and the nodes of its cells."""
     kind = SECOND_ORDER.get(block.type, block.type)
     if kind not in [*KINDS[dim], *SIDES_OF[dim], "vertex", "line"]:
-        raise ValueError(f"mesh: has cells {block.type!r}, must be of {' and '.join(KINDS[dim])} for a grid in {dim}D")
+        raise ValueError(f"mesh: has cells {block.type!r}, must have {' and '.join(KINDS[dim])} for a grid in {dim}D")
     rows = np.asarray(block.data, dtype=np.int64)
     return kind, rows if rows.ndim == 2 else rows.reshape(len(rows), 0)
 
@@ -175,16 +175,16 @@ def _vertices(dim: int, kind: str) -> int:
 
 
 def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
-    """Raise an error for cells with unknown nodes."""
+    """Raise an error for cells with node numbers that do not exist."""
     if rows.size and not (rows.min() >= 0 and rows.max() < count):
         worst = rows.min() if rows.min() < 0 else rows.max()
-        raise ValueError(f"mesh: a cell has the node {worst}, must be one of {count}, from 0 on")
+        raise ValueError(f"mesh: a cell has node {worst}, must be one of the {count} nodes, counted from 0")
 
 
 def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
-    """Return the largest distance, m, of edge nodes of second-order cells from the midpoints of the edges.
+    """Return the largest distance, m, between the edge nodes of second-order cells and the midpoints of edges.
 
-    Edge nodes follow the vertices, in an order that depends on the format.
+    Edge nodes follow the vertices in the row of a cell, in an order that depends on the format.
     """
     first, second = np.array(edges(kind)).T
     corners = x[rows[:, AS_LATTICE.get(kind, range(1 + second.max()))]]
@@ -203,7 +203,7 @@ def _warn_curved(grid: Grid, name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Return cells and their indices by part, where a cell of several parts occurs only once.
+    """Remove repetitions of cells that belong to several parts; return the cells and their indices by part.
 
     gmsh's format 2.2 repeats a cell for each of its physical groups.
     """
@@ -215,7 +215,7 @@ def _merged(
         several = np.flatnonzero(np.bincount(same)[same] > 1)
         member = np.stack([np.isin(several, found[kind]) for found in parts.values()] or [np.zeros(len(several), bool)])
         if len(np.unique(np.stack([same[several], *member]), axis=1).T) < len(several):
-            continue  # repeated in the same parts: an error if it is seeded
+            continue  # repeated in the same parts: an error if the cell is seeded
         order = np.argsort(first)  # in the order of the file
         number = np.empty_like(order)
         number[order] = np.arange(len(order))
@@ -233,9 +233,9 @@ def _groups(
     names: Mapping[str, int],
     tags: str | None,
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield names of groups, and which cells (count,) of a meshio block belong to them."""
+    """Yield the names of groups, and which cells (count,) of a meshio block belong to each."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
-    families = getattr(mesh, "cell_tags", None) or {}  # MED: names of groups by number
+    families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of groups for each number
     for key in (tags,) if tags is not None else TAGS:
         if key not in mesh.cell_data:
             continue
@@ -264,17 +264,17 @@ def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
 
 
 def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
-    """Return the user's numbers of tags by name, if any."""
+    """Return the user's tag numbers by name; empty if none were given."""
     whole = (int, np.integer)
     if names is not None and not (
         isinstance(names, Mapping) and all(isinstance(k, str) and isinstance(v, whole) for k, v in names.items())
     ):
-        raise ValueError(f"mesh: names = {line(names)}, must be numbers of tags by names, such as {{'top': 3}}")
+        raise ValueError(f"mesh: names = {line(names)}, must be numbers of tags by name, such as {{'top': 3}}")
     return names or {}
 
 
 def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield names, and which tags (n,) have them; other tags are named by their digits."""
+    """Yield each name and which of the tags (n,) have it.  Numbers without a name are named by their digits."""
     for name, number in names.items():
         if (tags == number).any():
             yield name, tags == number
@@ -284,7 +284,7 @@ def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tupl
 
 
 def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int64]]) -> NDArray[np.float64]:
-    """Return the first coordinates (nodes, dim) of vertices (nodes, 2 or 3); ValueError for cells outside one plane."""
+    """Return the first `dim` coordinates of vertices (nodes, 2 or 3).  In 2D, cells outside one plane are an error."""
     used = np.unique(np.concatenate([np.empty(0, np.int64), *(rows.ravel() for rows in cells.values())]))
     if not np.isfinite(x[used]).all():
         invalid = used[~np.isfinite(x[used]).all(axis=1)][0]
@@ -296,13 +296,13 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
 
 
 def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Mesh:
-    """Return a dolfinx mesh, gathered on every process, with cells sorted by position for any partition."""
+    """Gather a dolfinx mesh on every process.  Cells are sorted by position, so any partition gives the same result."""
     dim = grid.dim
     topology = mesh.topology
     kind = _compat.cell_kind(mesh)
     kind = {"quadrilateral": "quad", "tetrahedron": "tetra"}.get(kind, kind)
     if topology.dim != dim or kind not in OF_DOLFINX[dim]:
-        raise ValueError(f"mesh: has cells {kind!r}, must be of {' or '.join(OF_DOLFINX[dim])} for a grid in {dim}D")
+        raise ValueError(f"mesh: has cells {kind!r}, must have {' or '.join(OF_DOLFINX[dim])} for a grid in {dim}D")
     for name, tags, of in (("cell_tags", cell_tags, dim), ("facet_tags", facet_tags, dim - 1)):
         if tags is not None and getattr(tags, "dim", None) != of:
             raise ValueError(f"mesh: {name} = {line(tags)}, must be tags of entities of dimension {of}")
@@ -310,8 +310,8 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
     dofs = _compat.geometry_dofs(mesh)[:owned]
     vertices, orders = KINDS[dim][kind], OF_DOLFINX[dim][kind]
     if dofs.shape[1] not in (vertices, orders):
-        what = f"must have {vertices} or {orders}: of first or second order"
-        raise ValueError(f"mesh: its cells have {dofs.shape[1]} nodes, {what}")
+        what = f"must have {vertices} or {orders}, for first or second order"
+        raise ValueError(f"mesh: cells of {dofs.shape[1]} nodes, {what}")
     if dofs.shape[1] != vertices:
         off = _edge_node_distance(mesh.geometry.x, _as_meshio(dofs, kind), kind)
         count, off = mesh.comm.allreduce(owned), mesh.comm.allreduce(off, op=MPI.MAX)
@@ -340,13 +340,13 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
 
 
 def _as_meshio(nodes: NDArray[np.int32], kind: str) -> NDArray[np.int32]:
-    """Return nodes (n, k) of dolfinx's cells with the vertices in meshio's order."""
+    """Return the nodes (n, k) of dolfinx cells, with vertices in meshio's order."""
     order = AS_LATTICE.get(kind, [])
     return np.concatenate([nodes[:, order], nodes[:, len(order) :]], axis=1)
 
 
 def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the tags of entities on this process, 0 without a tag."""
+    """Return the tags of entities on this process; 0 for entities without a tag."""
     found = np.zeros(entities.shape, dtype=np.int64)
     if tags is not None and len(tags.indices):
         at = np.minimum(np.searchsorted(tags.indices, entities), len(tags.indices) - 1)
@@ -355,7 +355,7 @@ def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def _facets(dim: int, kind: str) -> list[NDArray[np.int64]]:
-    """Return the vertices of each facet of a cell in dolfinx's order."""
+    """Return the vertices of each facet of a cell, in dolfinx's order."""
     if KINDS[dim][kind] == dim + 1:
         return [np.delete(np.arange(dim + 1), k) for k in range(dim + 1)]
     return sorted(FACES[dim].tolist())

@@ -14,21 +14,21 @@ from mpm_dolfinx.bodies import abaqus_files, gmsh_files
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file, corrected for known errors of meshio; ValueError if that is impossible."""
+    """Return the mesh of a file.  Known errors of meshio are corrected, or raise ValueError."""
     if abaqus_files.is_abaqus(file):
         return abaqus_files.read(file)
     version = gmsh_files.version(file) if file.suffix.lower() == ".msh" else ""
     if version in ("4", "4.1"):
         return gmsh_files.read(file)
     if version == "4.0":
-        raise ValueError("gmsh's format 4.0, must be 2.2 or 4.1, such as gmsh -0 -format msh41 writes it")
+        raise ValueError("gmsh's format 4.0, must be 2.2 or 4.1, for example by gmsh -0 -format msh41")
     mesh = _bulk(file) if file.suffix.lower() in (".bdf", ".nas", ".fem") else meshio.read(file)
     _check_pieces(file, mesh)
     return mesh
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a Nastran file, also without the header that meshio needs, as gmsh writes it."""
+    """Return the mesh of a Nastran file.  gmsh writes files without the header that meshio needs; it is added."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")
@@ -39,24 +39,24 @@ def _bulk(file: Path) -> meshio.Mesh:
 
 
 def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
-    """Raise an error for a VTK file of several pieces, because meshio reads only the last one."""
+    """Raise an error for a VTK file with several pieces if meshio reads only the last one."""
     if file.suffix.lower() != ".vtu":
         return
     counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
     read, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
     if len(counts) > 1 and read != whole:
-        raise ValueError(f"{len(counts)} pieces of {whole} cells in all, but meshio reads {read}; must be one piece")
+        raise ValueError(f"{len(counts)} pieces with {whole} cells, but meshio reads {read}; must be one piece")
 
 
 def check_systems(mesh: meshio.Mesh) -> None:
-    """Raise an error for Nastran nodes in local coordinate systems, which meshio ignores."""
+    """Raise an error for Nastran nodes that are given in local coordinate systems, which meshio ignores."""
     systems = np.asarray(mesh.point_data.get("nastran:ref", 0))
     if systems.any():
         raise ValueError(f"mesh: GRID in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return cell sets by name, numbered within blocks; meshio numbers FLAC3D sets across all blocks."""
+    """Return the cells of sets by name, numbered within each block.  meshio numbers FLAC3D sets through all blocks."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

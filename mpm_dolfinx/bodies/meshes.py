@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Bodies from meshes: each cell becomes one or more particle domains.
+"""Bodies from meshes: each mesh cell becomes one or more particle domains.
 
-`mesh_cells` divides cells into domains.  Domains that are large for the grid are split further by their own
+`mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided further, by their
 (tri)linear map.
 """
 
@@ -26,25 +26,21 @@ from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
 
-LONG = 1.5  # times cells over per_cell: domains with longer edges are split
-SMALL = 0.2  # of the desired size of a domain: a warning reports smaller ones
+LONG = 1.5  # cells / per_cell: domains with longer edges are divided
+SMALL = 0.2  # of the desired domain size: smaller domains cause a warning
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh, equal on every process.
+    """A mesh, the same on every process.  In quadrilaterals and hexahedra, the first axis of nodes varies fastest."""
 
-    x (nodes, d): m; cells: kind -> nodes (n, k), quadrilaterals and hexahedra with the first axis fastest; parts: name
-    -> kind -> indices of its cells; sides: name -> facets as arrays (m, k) of nodes.
-    """
-
-    x: NDArray[np.float64]
-    cells: Mapping[str, NDArray[np.int64]]
-    parts: Mapping[str, Mapping[str, NDArray[np.int64]]]
-    sides: Mapping[str, Sequence[NDArray[np.int64]]]
+    x: NDArray[np.float64]  # positions of nodes (nodes, d), m
+    cells: Mapping[str, NDArray[np.int64]]  # cell type -> nodes (n, k)
+    parts: Mapping[str, Mapping[str, NDArray[np.int64]]]  # name of a part -> cell type -> indices of cells
+    sides: Mapping[str, Sequence[NDArray[np.int64]]]  # name of a side -> nodes of its facets, arrays (m, k)
 
     def part(self, name: str | None) -> dict[str, NDArray[np.int64]]:
-        """Return the cells of a part, or all cells, by kind."""
+        """Return the cells of a part, or all cells, by cell type."""
         if name is not None and (not isinstance(name, str) or name not in self.parts):
             known = ", ".join(map(repr, self.parts)) or "none, for the mesh has no parts with a name"
             raise ValueError(f"mesh: part {name!r}, must be one of its parts: {known}")
@@ -59,15 +55,11 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshBody(Body):
-    """A body seeded from a mesh; the boxes of its domains are bounding boxes.
+    """A body seeded from a mesh.  The boxes of its domains are bounding boxes."""
 
-    vertices (n, 2^d, d): corners of the domains before all maps, m; surface (n, d, 2): whether a face lies on the
-    surface; tagged: name -> (n, d, 2), whether a face belongs to a side.
-    """
-
-    vertices: NDArray[np.float64]
-    surface: NDArray[np.bool_]
-    tagged: Mapping[str, NDArray[np.bool_]]
+    vertices: NDArray[np.float64]  # corners of the domains before all maps (n, 2^d, d), m
+    surface: NDArray[np.bool_]  # whether a face lies on the surface of the body (n, d, 2)
+    tagged: Mapping[str, NDArray[np.bool_]]  # name of a side -> whether a face belongs to the side (n, d, 2)
 
     lattice = None
 
@@ -76,29 +68,29 @@ class MeshBody(Body):
 
     @property
     def dim(self) -> int:
-        """Number d of coordinates."""
+        """Number d of dimensions."""
         return self.vertices.shape[2]
 
     @cached_property
     def spacing(self) -> NDArray[np.float64]:
-        """Edges (n, d), m, of the boxes of domains."""
+        """Edge lengths (n, d), m, of the bounding boxes of domains."""
         return self.vertices.max(axis=1) - self.vertices.min(axis=1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of domains."""
+        """Return the lower corners (m, d), m, of the bounding boxes of the chosen domains."""
         return self.vertices[chosen].min(axis=1)
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
         return self.surface[chosen]
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of domains."""
+        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
         return centroids(self.vertices[chosen])
 
     @property
     def aligned(self) -> bool:
-        """Whether the domains are boxes along the axes: not in general."""
+        """Whether all domains are boxes with edges along the axes; False for a mesh."""
         return False
 
     @property
@@ -107,13 +99,13 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on a side, ascending, and the numbers (m,) of these faces."""
+        """Return the domains (m,) with a face on the side `name`, in ascending order, and their face numbers (m,)."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face of this direction, and the numbers of these faces; see `Body`."""
+        """Return the domains (m,) with a surface face in a direction, and the face numbers; see `Body.facing`."""
         row, face = self.outer()
         outward = face_vectors(self.corners(row), face)
         along = np.abs(outward).argmax(axis=1) == axis
@@ -121,16 +113,16 @@ class MeshBody(Body):
         return row[along], face[along]
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains across an axis, and their mean edge, m."""
+        """Return the mean number of domains along an axis, and their mean edge length, m."""
         edge = float(self.spacing[:, axis].mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of domains, before the map."""
+        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
         return self.vertices[chosen]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return numbers (m, 2^d) of the corners of domains; shared corners have one number."""
+        """Return node numbers (m, 2^d) of the corners of domains, equal for shared corners."""
         return self._nodes[rows]
 
     @cached_property
@@ -175,9 +167,9 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facets of their faces, and their cells.
+    """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facet that contains each face, and their cells.
 
-    Nodes ascend, after -1 for triangles; faces inside a cell have only -1.
+    Nodes of a facet ascend; a -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -196,7 +188,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Raise an error for repeated cells, which would count twice in weight and stiffness."""
+    """Raise an error for repeated cells: their weight and stiffness would count twice."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
@@ -214,7 +206,10 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error for two cells on the same side of a common facet (m,), by the sum of their outward vectors."""
+    """Raise an error for cells on the same side of a common facet, found from the sum of their outward vectors.
+
+    `facet` is the facet of each face of `domains`; `shared` (m,) tells which facets belong to two cells.
+    """
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
     of = facet.ravel()
@@ -236,19 +231,19 @@ def _check_overlaps(
 ) -> None:
     """Raise an error for overlapping cells.
 
-    Cells lie on both sides of each shared facet, so the number of cells at a place changes only across the surface.  An
-    overlap therefore involves a cell with a facet on the surface.
+    Each facet inside the mesh has a cell on both sides.  The number of cells at a position therefore changes only
+    across the surface, and an overlap involves a cell with a facet on the surface.
 
     Parameters
     ----------
     x : (nodes, d), m
-        Positions of nodes.
+        Positions of the nodes.
     cells
-        Cells by kind.
+        Nodes of the cells by cell type.
     outer : (m,)
-        Cells with a facet on the surface.
+        Indices of the cells with a facet on the surface.
     neighbours : (n, 2)
-        Cells that share a facet.
+        Pairs of cells that share a facet.
     """
     corners = [x[nodes] for nodes in cells.values()]
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
@@ -275,9 +270,9 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pairs (n,), (n,) of an outer cell and another cell with overlapping boxes (m, 2, d).
+    """Return pairs (n,), (n,) of a surface cell and any other cell whose bounding boxes (m, 2, d) overlap.
 
-    The search runs by octaves of box size, so that a few large boxes do not find all small ones.
+    Boxes are grouped by size, in octaves.  Otherwise the search radius of a large box would include all small ones.
     """
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
@@ -297,7 +292,7 @@ def _box_overlaps(
 
 
 def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return domains and keys of their faces, with the first two axes of left-handed domains swapped."""
+    """Swap the first two axes of left-handed domains; return the domains and the facets (keys) of their faces."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
     swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
@@ -308,7 +303,7 @@ def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[ND
 
 
 def _check_convex(domains: NDArray[np.float64], name: str) -> None:
-    """Raise an error for flat, inverted or non-convex cells: a corner, or a simplex of the cutting, has no volume."""
+    """Raise an error for cells that are flat, inverted or not convex: at a corner, or in a simplex of the division."""
     d, bits = domains.shape[2], corner_bits(domains.shape[2])
     size = np.ptp(domains, axis=1).prod(axis=1)
     ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
@@ -320,11 +315,11 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
     if len(invalid):
         x = domains[invalid[0]].mean(axis=0)
         what = f"{len(invalid)} cells are flat, turned inside out or not convex, the first at {x}"
-        raise ValueError(f"{name}: {what}; must be convex, of corners that are not flat")
+        raise ValueError(f"{name}: {what}; must be convex, with no flat corner")
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct facets (m, k), the first for faces inside cells, and the facet of each face (n, 2d)."""
+    """Return the distinct facets (m, k), and the facet of each face (n, 2d).  Facet 0 stands for faces inside cells."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
@@ -343,14 +338,17 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return domains (m, 2^d, d) that are small enough for the grid, their original domains, and faces (m, d, 2)."""
+    """Divide domains that are too large for the grid; return corners (m, 2^d, d), original domains (m,), outer faces.
+
+    The last array (m, d, 2) tells which faces of a new domain lie on faces of the original domain.
+    """
     d = grid.dim
     bits = corner_bits(grid.dim)
     out = []
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
     if grid.even:
         longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
-    else:  # lengths in cells
+    else:  # edges are measured in cells
         y = grid.in_cells(domains - grid.base)
         edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
         longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)
@@ -367,7 +365,7 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Raise an error for surface faces in contact within one mesh, which would be loaded and drained."""
+    """Raise an error for surface faces of one mesh that touch each other; they would be loaded and drained."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):
@@ -377,7 +375,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
 
 
 def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody:
-    """Return the body; warn about domains that are much smaller than the grid needs."""
+    """Warn about domains that are much smaller than the grid resolves; return the body."""
     cell = grid.sizes_at(body.centre - grid.base).prod(axis=-1)
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)

@@ -1,73 +1,97 @@
 # SPDX-License-Identifier: MIT
-"""Overburden: weight of the domains vertically above positions in the bodies."""
+"""Overburden: weight of the domains vertically above positions in the bodies.
+
+Vertical lines enter and leave domains through faces.  In 3D each face consists of triangles about its middle, as where
+the grid cuts domains.  Domains that share a face therefore leave no gap, and do not overlap.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.bodies.touching import face_vectors
-from mpm_dolfinx.points.cutting import FACES
+from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
 
 
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overburden stress (m,), Pa, at positions, and the surface level (m,), m, above them.
+    """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
+
+    Both are means over lines on all sides of a position, because a border of domains may lie above the position.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
-        Convex domains of all bodies; the last axis is vertical.
+        Corners of the particle domains of all bodies; the last axis is vertical.
     unit_weight : (n,), N/m^3
         Unit weights of the domains.
     x : (m, d), m
         Positions in the domains.
     """
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    half = (high - low)[:, :-1].max(initial=0.0) / 2
-    aside = SAME * (high - low)[:, :-1].min(initial=np.inf) * np.sqrt([2.0, 3.0])[: x.shape[1] - 1]
-    across, line = np.unique(x[:, :-1] + aside, axis=0, return_inverse=True)
-    line, middle = line.reshape(len(x)), (low + high)[:, :-1] / 2
-    pairs = cKDTree(across).sparse_distance_matrix(cKDTree(middle), half * (1 + SAME), p=np.inf, output_type="ndarray")
-    ray, domain = pairs["i"], pairs["j"]
-    inside = ((across[ray] >= low[domain, :-1]) & (across[ray] <= high[domain, :-1])).all(axis=1)
+    least = np.ptp(corners[..., :-1], axis=1).min(initial=np.inf)
+    aside = SAME * least * np.sqrt([2.0, 3.0])[: x.shape[1] - 1] * (1 - 2 * corner_bits(x.shape[1] - 1))
+    weight, surface = np.mean([_along(corners, unit_weight, x, x[:, :-1] + one) for one in aside], axis=0)
+    return weight, surface
+
+
+def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
+    """Return overburden stress, Pa, and surface level, m, above positions x along vertical lines at (m, d-1)."""
+    low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
+    half = (high - low).max(initial=0.0) / 2
+    across, line = np.unique(places, axis=0, return_inverse=True)
+    line = line.reshape(len(x))
+    near = cKDTree(across).sparse_distance_matrix(
+        cKDTree((low + high) / 2), half * (1 + SAME), p=np.inf, output_type="ndarray"
+    )
+    ray, domain = near["i"], near["j"]
+    inside = ((across[ray] >= low[domain]) & (across[ray] <= high[domain])).all(axis=1)
     ray, domain = ray[inside], domain[inside]
-    bottom, top = _chord(corners[domain], across[ray], low[domain, -1], high[domain, -1])
-    crossed = top > bottom
-    ray = ray[crossed]
-    weight = unit_weight[domain[crossed]]
-    bottom = bottom[crossed]
-    top = top[crossed]
+    hits = [
+        (ray[on], height, sign * unit_weight[domain[on]]) for on, height, sign in _hits(corners[domain], across[ray])
+    ]
+    ray, height, weight = (np.concatenate(column) for column in zip(*hits, strict=True))
     surface = np.full(len(across), -np.inf)
-    np.maximum.at(surface, ray, top)
-    # positions on one vertical line share cumulative sums, sorted by line and height
-    order = np.lexsort((bottom, ray))
+    np.maximum.at(surface, ray, height)
+    # positions on the same vertical line share cumulative sums, sorted by line and height
+    order = np.lexsort((height, ray))
     ray = ray[order]
+    height = height[order]
     weight = weight[order]
-    bottom = bottom[order]
-    top = top[order]
-    total = np.concatenate([[0.0], np.cumsum(weight * (top - bottom))])
-    ends = np.searchsorted(ray, np.arange(len(across)), side="right")
-    scale = 1 + np.ptp(corners[..., -1])
-    after = np.searchsorted(ray * scale + (bottom - corners[..., -1].min()), line * scale + x[:, -1] - low[:, -1].min())
-    own = np.maximum(after - 1, 0)
-    part = np.where(ray[own] == line, weight[own] * np.maximum(top[own] - x[:, -1], 0.0), 0.0)
-    return total[ends[line]] - total[after] + part, np.maximum(surface[line], x[:, -1])
+    base, scale = x[:, -1].min(initial=np.inf), 1 + np.ptp(corners[..., -1])
+    height = height - base
+    ends = np.searchsorted(ray, line, side="right")
+    begins = np.searchsorted(ray * scale + height, line * scale + x[:, -1] - base)
+    moment, total = (np.concatenate([[0.0], np.cumsum(values)]) for values in (weight * height, weight))
+    moment, total = (values[ends] - values[begins] for values in (moment, total))
+    return moment - total * (x[:, -1] - base), np.maximum(surface[line], x[:, -1])
 
 
-def _chord(corners: NDArray, across: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the heights (m,), (m,), m, at which vertical lines at (m, d-1) enter and leave domains (m, 2^d, d)."""
+def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
+    """Yield indices (k,) of vertical lines that cross a face of their domain (m, 2^d, d), heights and signs (k,).
+
+    `at` (m, d-1) are the positions of the lines.  A sign is 1 where the line leaves the domain upwards, else -1.
+    """
     d = corners.shape[2]
-    for face in range(2 * d):
-        n, on = face_vectors(corners, face), corners[:, FACES[d][face]].mean(axis=1)
-        depth = ((across - on[:, :-1]) * n[:, :-1]).sum(axis=1)  # n . (x - on) <= 0 inside
-        slope = n[:, -1]
-        steep = np.abs(slope) > SAME * np.linalg.norm(n, axis=1)
-        at = on[:, -1] - np.divide(depth, slope, out=np.zeros(len(n)), where=steep)
-        high = np.where(steep & (slope > 0), np.minimum(high, at), high)
-        low = np.where(steep & (slope < 0), np.maximum(low, at), low)
-        high = np.where(~steep & (depth > 0), -np.inf, high)
-    return low, high
+    for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):
+        x = corners[:, face]
+        if d == 2:
+            a, b = x[:, 0], x[:, 1]
+            on = np.flatnonzero((a[:, 0] > at[:, 0]) != (b[:, 0] > at[:, 0]))
+            a, b = a[on], b[on]
+            share = (at[on, 0] - a[:, 0]) / (b[:, 0] - a[:, 0])
+            yield on, a[:, 1] + share * (b[:, 1] - a[:, 1]), turn * np.sign(a[:, 0] - b[:, 0])
+            continue
+        x = np.concatenate([x, x.mean(axis=1, keepdims=True)], axis=1)
+        for corner in ABOUT_MIDDLE:
+            part = x[:, corner]
+            off = part[:, :, :2] - at[:, None]
+            area = np.cross(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # opposite to each corner
+            on = np.flatnonzero((area > 0).all(axis=1) | (area < 0).all(axis=1))
+            area = area[on]
+            whole = area.sum(axis=1)
+            yield on, (area * part[on, :, 2]).sum(axis=1) / whole, turn * np.sign(whole)

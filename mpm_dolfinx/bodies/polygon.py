@@ -28,10 +28,10 @@ def polygon(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a polygon, such as a slope or a layer, with points; return the body.
+    """Seed a polygon, such as a slope or a soil layer, with material points; return the body.
 
-    Layers and parts are separate polygons.  Polygons in contact stick without a surface between them, for any sizes of
-    their quadrilaterals.  Needs gmsh.
+    Each layer is a separate polygon.  Polygons in contact stick without a surface between them, even if their
+    quadrilaterals differ in size.  The function needs gmsh.
 
     Parameters
     ----------
@@ -40,11 +40,11 @@ def polygon(
     corners : (m, 2), m
         Consecutive corners, in either direction.
     sides
-        Name of the edge from each corner to the next, "" for none, or one name for all; edges may share a name.
+        Name of the edge from each corner to the next, or "" for no name.  A single name applies to all edges.
     holes : name -> (k, 2), m
-        Corners of holes, such as a tunnel, by the names of their sides.
+        Corners of each hole, such as a tunnel.  The key is the name of the hole's side.
     size
-        Edge of the quadrilaterals, m; by default for per_cell points per cell and direction.
+        Edge length of the quadrilaterals, m.  By default the cell size divided by `per_cell`.
     per_cell, material
         As for `from_mesh`.
 
@@ -53,11 +53,11 @@ def polygon(
     ImportError
         gmsh is missing.
     ValueError
-        A polygon or hole that crosses itself or another, or lies outside the grid; names that do not match.
+        A polygon or hole that crosses itself or another outline, or leaves the grid.  Wrong number of side names.
     """
     instance("body: grid", grid, Grid)
     if grid.dim != 2:
-        raise ValueError(f"polygon: grid of {grid.dim} dimensions, must have 2; in 3D take a mesh (`from_mesh`)")
+        raise ValueError(f"polygon: grid of {grid.dim} dimensions, must have 2; in 3D use a mesh (`from_mesh`)")
     outline = _outline("corners", corners)
     sides = [sides] * len(outline) if isinstance(sides, str) else sides
     if not isinstance(sides, Sequence) or len(sides) != len(outline) or not all(isinstance(s, str) for s in sides):
@@ -81,7 +81,7 @@ def polygon(
 
 
 def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
-    """Return corners (m, 2), m; ValueError for coincident neighbours."""
+    """Return the corners (m, 2), m, of an outline; raise ValueError if two neighbours coincide."""
     allowed = "at least 3 corners of 2 finite coordinates each, no two neighbours the same"
     x = numbers(f"polygon: {name}", corners, None, allowed=allowed)
     if x.ndim != 2 or x.shape[1] != 2 or len(x) < 3 or not np.any(np.roll(x, -1, axis=0) != x, axis=1).all():
@@ -90,13 +90,13 @@ def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
 
 
 def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
-    """Raise an error for outlines that touch or cross themselves or others, and for holes outside the polygon."""
+    """Raise an error for outlines that touch or cross themselves or each other, and for holes outside the polygon."""
     a, stop = np.concatenate(outlines), np.cumsum([len(x) for x in outlines])
     after = np.concatenate([np.roll(rows, -1) for rows in np.split(np.arange(len(a)), stop[:-1])])
     b = a[after]
     i, j = np.triu_indices(len(a), 1)
     adjacent = (after[i] == j) | (after[j] == i)
-    # two edges intersect if the ends of each are not on one side of the other
+    # two edges intersect unless both ends of one edge lie on the same side of the other
     slack = ROUND_OFF * np.ptp(outlines[0], axis=0).max() ** 2
     sides = [_areas(a[i], b[i], a[j]), _areas(a[i], b[i], b[j]), _areas(a[j], b[j], a[i]), _areas(a[j], b[j], b[i])]
     separate = np.any([(np.minimum(*s) > slack) | (np.maximum(*s) < -slack) for s in (sides[:2], sides[2:])], axis=0)
@@ -115,7 +115,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed areas (n,) of the parallelograms from a to b and to c (n, 2): > 0 on the left of a to b."""
+    """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is on the left of a to b."""
     return _cross(b - a, c - a)
 
 
@@ -125,7 +125,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
-    """Return whether a position (2,) is inside a polygon: a ray from it crosses an odd number of edges."""
+    """Return whether a position x (2,) is inside a polygon: a ray from x crosses an odd number of edges."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
     return bool((crosses & ((_cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
@@ -133,19 +133,19 @@ def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
 
 @contextmanager
 def _gmsh() -> Iterator:
-    """Provide gmsh with a separate model, and restore the user's gmsh state and handler of Ctrl-C."""
+    """Provide gmsh with a separate model.  Afterwards restore the user's gmsh state and handler of Ctrl-C."""
     handler = signal.getsignal(signal.SIGINT)
     try:
         import gmsh
     except ImportError as error:
         what = "polygon: needs gmsh: on Debian `apt install python3-gmsh`, elsewhere `conda install python-gmsh`"
         raise ImportError(what, name="gmsh") from error
-    reports = hasattr(gmsh, "isInitialized")  # before 4.9 its state is unknown: initialised again, never finalised
+    reports = hasattr(gmsh, "isInitialized")  # missing before 4.9: then initialise again and never finalise
     running, verbosity = reports and gmsh.isInitialized(), 0.0
     if running or not reports:
-        with suppress(Exception):  # before 4.9 it raises after an earlier finalisation
+        with suppress(Exception):  # before 4.9 this raises after an earlier finalisation
             verbosity = gmsh.option.getNumber("General.Terminal")
-            gmsh.option.setNumber("General.Terminal", 0)  # hides the message about initialising again
+            gmsh.option.setNumber("General.Terminal", 0)  # hides the message about the second initialisation
     if not running:
         gmsh.initialize()
     before = gmsh.model.getCurrent()
@@ -164,7 +164,7 @@ def _gmsh() -> Iterator:
 
 
 def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
-    """Return a polygon with holes, filled with quadrilaterals of a size, m, and single triangles where necessary."""
+    """Return the mesh of a polygon with holes: quadrilaterals with edges of `size`, m, and a few triangles."""
     extent = np.ptp(loops[0][0], axis=0).max()
     origin = extent * np.round(loops[0][0][0] / extent, -2)  # gmsh aborts at large coordinates
     with _gmsh() as gmsh:
@@ -179,7 +179,7 @@ def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: fl
                 named.setdefault(name, []).append(tag)
         surface = geo.addPlaneSurface(curves)
         geo.synchronize()
-        gmsh.model.mesh.setRecombine(2, surface)  # thirds of triangles have less accurate stresses
+        gmsh.model.mesh.setRecombine(2, surface)  # triangles, divided into three, have less accurate stresses
         gmsh.model.mesh.generate(2)
         tags, x, _ = gmsh.model.mesh.getNodes()
         number = np.zeros(int(max(tags, default=0)) + 1, dtype=np.int64)

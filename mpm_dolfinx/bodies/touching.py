@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Contact between bodies: covered parts of faces, and distances between domains.
+"""Contact between seeded bodies: covered parts of faces, and distances between domains.
 
-Faces are quadrilaterals in space.  In plane strain they have unit width along a third axis.
+Faces are quadrilaterals in space.  In plane strain they have unit width along the third axis.
 """
 
 from __future__ import annotations
@@ -25,21 +25,17 @@ BITS = corner_bits(2)  # Source: definition
 
 @dataclass
 class Faces:
-    """Faces of a body after its map; arrays over m faces.
+    """Faces of a body after its map; arrays over m faces."""
 
-    row (m,): domain; index (m, 4): corners of the domain; corners (m, 4, 3): m; outward (m, 3): area vector, m^2; bend
-    (m,): m, see `Body.bend`.
-    """
-
-    row: NDArray[np.int64]
-    index: NDArray[np.int64]
-    corners: NDArray[np.float64]
-    outward: NDArray[np.float64]
-    bend: NDArray[np.float64]
+    row: NDArray[np.int64]  # domain of the face (m,)
+    index: NDArray[np.int64]  # numbers of the face's corners in the domain (m, 4)
+    corners: NDArray[np.float64]  # positions of the corners (m, 4, 3), m
+    outward: NDArray[np.float64]  # outward area vector (m, 3), m^2
+    bend: NDArray[np.float64]  # distance of straight edges from the mapped ones (m,), m, see `Body.bend`
 
     @classmethod
     def of(cls, body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> Faces:
-        """Return faces of a body by domain (m,) and face number (m,)."""
+        """Return the faces of a body with domains `row` (m,) and face numbers `face` (m,)."""
         domains, dim = body.corners(row), body.dim
         outward = np.pad(face_vectors(domains, face), ((0, 0), (0, 3 - dim)))
         index = face_index(dim)[face]
@@ -54,7 +50,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the shorter of the two edges (m, 2), m, along each axis of a face."""
+        """Return the lengths (m, 2), m, of the shorter edge of each face along the first and the second face axis."""
         c = self.corners
         along = [np.linalg.norm([c[:, 1] - c[:, 0], c[:, 3] - c[:, 2]], axis=2)]
         along += [np.linalg.norm([c[:, 2] - c[:, 0], c[:, 3] - c[:, 1]], axis=2)]
@@ -65,28 +61,28 @@ class Faces:
 class Cover:
     """Pairs of faces in contact; arrays over n pairs.
 
-    face (n,): the covered face; by (n,): the covering face; low, high (n, 2): bounding box of the covering face in the
-    coordinates of the covered one, from 0 to 1; corner (n, 4): corner of this box for each corner of the covering face,
-    -1 if it is rotated relative to the box; t (n, 4, 2): its corners; slack (n,): error of the coordinates; plane (n,
-    4, 2): its corners in affine coordinates along two edges of the covered face, in which straight lines stay straight.
+    The covering face lies on the covered face.  Face coordinates run from 0 to 1 along two edges of the covered face.
     """
 
-    face: NDArray[np.int64]
-    by: NDArray[np.int64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    corner: NDArray[np.int64]
-    t: NDArray[np.float64]
-    slack: NDArray[np.float64]
-    plane: NDArray[np.float64]
+    face: NDArray[np.int64]  # the covered face (n,)
+    by: NDArray[np.int64]  # the covering face (n,)
+    low: NDArray[np.float64]  # lower corner of the covering face's bounding box (n, 2), in face coordinates
+    high: NDArray[np.float64]  # upper corner of this box (n, 2)
+    corner: NDArray[np.int64]  # corner of this box for each corner of the covering face (n, 4); -1 for rotated faces
+    t: NDArray[np.float64]  # corners of the covering face (n, 4, 2), in face coordinates
+    slack: NDArray[np.float64]  # error of the face coordinates (n,)
+    plane: NDArray[np.float64]  # corners of the covering face (n, 4, 2), in affine coordinates of the covered face
 
     def at(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return bilinear weights (n, 4) of the covering faces' corners at coordinates t (n, 2) of the covered ones."""
+        """Return the bilinear weights (n, 4) of the covering faces' corners at face coordinates t (n, 2)."""
         return np.take_along_axis(weights((t - self.low) / (self.high - self.low)), self.corner, axis=1)
 
 
 def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
-    """Return the outward area vectors (m, d), m^(d-1), of faces of domains (m, 2^d, d), by face numbers (m,) or one."""
+    """Return the outward area vectors (m, d), m^(d-1), of one face of each domain (m, 2^d, d).
+
+    `face` is the number of the face, (m,) or the same for all domains.
+    """
     dim = corners.shape[2]
     x = corners[np.arange(len(corners))[:, None], FACES[dim][face]]
     if dim == 2:
@@ -98,21 +94,21 @@ def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) ->
 
 
 _OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
-"""Signs of the cross products of the faces' edges."""
+"""Sign that turns the cross product of a face's edges outwards."""
 
 
 def face_index(dim: int) -> NDArray[np.int64]:
-    """Return the corners (2d, 4) of the faces of a domain; in plane strain each twice, at both ends of a third axis."""
+    """Return the corners (2d, 4) of the faces of a domain.  In plane strain each occurs at both ends of axis 3."""
     return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
 
 
 def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the bilinear weights (n, 4) of a face's corners at coordinates t (n, 2) in [0, 1]."""
+    """Return the bilinear weights (n, 4) of a face's corners at face coordinates t (n, 2) in [0, 1]."""
     return np.where(BITS, t[:, None], 1 - t[:, None]).prod(axis=2)
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) with boxes within a distance `distance`."""
+    """Return pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose bounding boxes are within a distance."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -131,7 +127,7 @@ def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) 
 
 
 def covers(own: Faces, other: Faces) -> Cover:
-    """Return the contacts between faces of a body and opposite faces of another."""
+    """Return the contacts between faces of one body and opposite faces of another body."""
     i, j = near(own.corners, other.corners)
     n, m = (f.outward / np.maximum(np.linalg.norm(f.outward, axis=1, keepdims=True), TINY) for f in (own, other))
     opposite = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
@@ -153,11 +149,11 @@ def covers(own: Faces, other: Faces) -> Cover:
     ends = [np.clip(x, *within) for x in box]
     on = ((ends[1] - ends[0]) > slack[:, None]).all(axis=1)
     at = (ends[0] + ends[1]) / 2
-    off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # differs only for faces that are not parallelograms
+    off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # equals `middle` if faces are parallelograms
     at = np.where(straight[:, None], at, local(own.corners[i], off_edges[:, None], n[i])[0][:, 0])
     middle = np.einsum("nk,nkd->nd", weights(at), own.corners[i])
     _, in_plane = local(other.corners[j], middle[:, None], m[j])
-    gap = np.where(straight, 0.0, np.abs(in_plane[:, 0]))  # rotated faces: at the middle of the overlap
+    gap = np.where(straight, 0.0, np.abs(in_plane[:, 0]))  # of rotated faces: at the middle of the overlap
     with np.errstate(divide="ignore", invalid="ignore"):  # boxes of zero width, excluded by `on`
         for bits in BITS:
             at = out.at(np.where(bits, ends[1], ends[0]))
@@ -167,12 +163,15 @@ def covers(own: Faces, other: Faces) -> Cover:
 
 
 def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return faces (n, 4, 3) with the last corner moved, so that they are parallelograms."""
+    """Return faces (n, 4, 3) as parallelograms: the last corner is moved."""
     return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
 def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the coordinates (n, c, 2) of positions x (n, c, 3) in faces (n, 4, 3), and their normal distances."""
+    """Return the face coordinates (n, c, 2) of positions x (n, c, 3), and their distances (n, c) along the normal.
+
+    `corners` (n, 4, 3) are the faces; `normal` (n, 3) are their unit normals.
+    """
     t = np.full((*x.shape[:2], 2), 0.5)
     c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
     for _ in range(8):  # Gauss-Newton; the first step is exact for parallelograms
@@ -189,7 +188,7 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
 
 
 def covered(count: int, cover: Cover) -> NDArray[np.float64]:
-    """Return the covered fraction of each face (m,), in its coordinates."""
+    """Return the covered fraction (m,) of each face, as area in face coordinates."""
     s, owner = within(*_triangles(cover.t, cover.face), np.zeros(2), np.ones(2))
     return sum_by(owner, _areas(s), count)
 
@@ -197,7 +196,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces (m,) as triangles: the face (n,), and corners (n, 3, 2) in [0, 1]."""
+    """Return the free parts of faces (m,) as triangles: the face (n,) of each, and its corners (n, 3, 2) in [0, 1]."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -206,11 +205,11 @@ def uncovered_triangles(
     first = np.searchsorted(cover.face[of], faces)
     count = np.searchsorted(cover.face[of], faces, "right") - first
     s, owner = _triangles(whole, np.arange(len(faces)))
-    for k in range(count.max()):  # subtract the k-th covering face of each
+    for k in range(count.max()):  # subtract the k-th covering face from each face
         has = count[owner] > k
         free, whose = [s[:, :, ~has]], [owner[~has]]
         s, owner = s[:, :, has], owner[has]
-        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # in order around
+        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # corners around the face
         orientation = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
         for a in range(4):
             p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
@@ -226,7 +225,7 @@ def uncovered_triangles(
     slack = np.zeros(len(faces))
     np.maximum.at(slack, np.searchsorted(faces, cover.face[of]), cover.slack[of])
     edge = np.linalg.norm(s - s[[1, 2, 0]], axis=1).max(axis=0)
-    some = 2 * _areas(s) > 2 * slack[owner] * edge  # removes slivers between different chords of a curve
+    some = 2 * _areas(s) > 2 * slack[owner] * edge  # removes slivers between different chords of the same curve
     s, owner = s[:, :, some].transpose(2, 0, 1), owner[some]
     kites = np.abs(whole[owner] - BITS).max(axis=(1, 2), initial=0.0) > SAME
     x = np.einsum(
@@ -237,7 +236,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the parts of triangles (3, 2, n) in boxes (2,) or (n, 2), and their owners."""
+    """Clip triangles (3, 2, n) to boxes [low, high], (2,) or (n, 2); return the parts, and the owner of each."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -247,13 +246,13 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return quadrilaterals (n, 4, 2) as two triangles each (3, 2, 2n), and their owners."""
+    """Divide each quadrilateral (n, 4, 2) into two triangles; return the triangles (3, 2, 2n), and their owners."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """Return the cross products (...) of vectors (..., 2)."""
+    """Return the scalar cross products (...) of vectors (..., 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -263,7 +262,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return the parts of triangles (3, e, n) below a plane of an axis, and above it, each with owners."""
+    """Divide triangles (3, e, n) at a plane normal to an axis; return parts below and above, each with owners."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -276,22 +275,22 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the free rectangles of faces: the face (m,) of each, and its lower and upper corners (m, 2).
+    """Return the rectangles of faces that no box covers: the face (m,) of each, and lower and upper corners (m, 2).
 
     Parameters
     ----------
     count
         Number of faces.
     face, low, high : (n,), (n, 2), (n, 2)
-        Boxes that cover faces, in coordinates from 0 to 1 over a face.
+        Faces, and the boxes that cover parts of them, in face coordinates from 0 to 1.
     slack : (n,)
-        Largest difference between ends of boxes that coincide.
+        Largest difference between the ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)
     k, most = len(touched), np.full(len(touched), SAME)
     np.maximum.at(most, row, slack)
-    # along both axes: planes through the ends of boxes, for all faces in turn
+    # along both axes: lines through the ends of boxes, for all faces in turn
     ends = []
     lines = []
     start = []
@@ -318,15 +317,15 @@ def uncovered(
             np.add.at(cover, offset[row] + ends[0][e0] * size[1][row] + ends[1][e1], 1 if e0 == e1 else -1)
     owner = np.repeat(np.arange(k), block)
     i, j = np.divmod(np.arange(len(cover)) - offset[owner], size[1][owner])
-    cover = np.cumsum(cover)  # along the second axis; each row of a face has sum zero
+    cover = np.cumsum(cover)  # along the second axis; increments in each row of a face add up to zero
     across = np.lexsort((i, j, owner))
     cover[across] = np.cumsum(cover[across])
     free = (cover == 0) & (i < size[0][owner] - 1) & (j < size[1][owner] - 1)
-    begin = np.flatnonzero(free & np.append(True, ~free[:-1])[: len(free)])  # runs along the second axis
+    begin = np.flatnonzero(free & np.append(True, ~free[:-1])[: len(free)])  # runs of free cells along the second axis
     stop = np.flatnonzero(free & np.append(~free[1:], True)[: len(free)])
     order = np.lexsort((i[begin], j[stop], j[begin], owner[begin]))
     begin, stop = begin[order], stop[order]
-    same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # runs of runs along the first axis
+    same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # equal in adjacent runs
     first = np.append(True, np.any([np.diff(s) != 0 for s in same], axis=0))[: len(begin)]
     last = np.append(first[1:], True)[: len(begin)]
     stop = stop[last]
@@ -343,9 +342,9 @@ def uncovered(
 
 
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gaps (n,), m, between convex domains a, b (n, 2^d, d), m; a negative gap is the overlap.
+    """Return the gaps (n,), m, between convex domains a and b (n, 2^d, d), m; a negative gap is the depth of overlap.
 
-    Domains do not overlap if a plane separates them: parallel to a face or, in 3D, to an edge of each.
+    Domains do not overlap if a plane separates them that is parallel to a face or, in 3D, to an edge of each domain.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
@@ -359,7 +358,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest distances (n,), m, between two separating planes of these normals (n, d)."""
+    """Return the largest distance (n,), m, between two parallel planes that separate a and b, for normals (n, d)."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -371,7 +370,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return convex domains (m, 2^d, d), m, that fill a body, one for a box, and their tolerances (m,), m."""
+    """Return convex domains (m, 2^d, d), m, that fill a body, and their tolerances (m,), m; one domain for a box."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
@@ -380,7 +379,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     warp = np.zeros(len(body))
     if len(size) == 3 and not body.aligned:
         for face, index in enumerate(FACES[3]):
-            f, n = corners[:, index], face_vectors(corners, face)  # only the normal part is warp
+            f, n = corners[:, index], face_vectors(corners, face)  # only the part along the normal is warp
             off = np.einsum("nd,nd->n", f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], n)
             warp = np.maximum(warp, np.abs(off) / np.maximum(np.linalg.norm(n, axis=1), TINY) / 4)
     edge = np.ptp(corners, axis=1).min(axis=1)
@@ -388,7 +387,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the tolerance of gaps and overlaps, m, of touching domains with edges (m,), m."""
+    """Return the tolerance, m, for gaps and overlaps of touching domains with edge lengths (m,), m."""
     return NEAR / 2 * edge
 
 
@@ -397,10 +396,10 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of domains, m, their smallest gap in cells, and its place (d,).
+    """Return the largest overlap of domains, m, their smallest gap in cells, and the position (d,), m.
 
-    in_cells: converts positions to cells; a, b: domains and tolerances, see `solids`.  Touching domains have overlap 0
-    and gap 0; distant ones a gap of inf.
+    `a` and `b` are domains and tolerances, see `solids`.  `in_cells` converts positions to cells.  Touching domains
+    have overlap 0 and gap 0; the gap of distant domains is inf.
     """
     i, j = near(a[0], b[0])
     separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
@@ -421,7 +420,7 @@ def meeting(
 
 
 def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-    """Raise an error for seeded bodies that overlap; warn about separate bodies that will stick."""
+    """Raise an error for seeded bodies that overlap.  Warn about separate bodies that share nodes and will stick."""
     indices = [i for i in range(len(bodies)) if present[i]]
     found = {i: solids(bodies[i]) for i in indices} if len(indices) > 1 else {}
     first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
@@ -442,7 +441,7 @@ def _inside(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
-    """Warn about bodies with a gap below one cell: they share nodes, and therefore stick."""
+    """Warn about bodies with a gap smaller than a cell: they share nodes of the grid, and therefore stick."""
     if 0 < gap < 1:
         where = "%s: %.2g cells apart at %s, but they stick, because they share nodes of the grid"
         warn(

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Interface of all loads on the momentum: tractions, prescribed displacements, tools, weight, user conditions.
+"""Interface of all loads in the momentum balance: tractions, prescribed displacements, tools, weight, user conditions.
 
-A condition has a method `acting(setting)` that returns an `Acting`.  Conditions on the fluid: `flow/feeding.py`.
+The method `acting(setting)` of a condition returns an `Acting`.  See `flow/feeding.py` for conditions on the fluid.
 
-Each condition has three levels.  `Acting` is made once a stage and finds the faces.  `Acting.placed` returns the
-`Loads` of a substep at the present position of the faces.  `Loads` add to residual and tangent at each assembly.  The
-step and the momentum balance loop over all of them, and know no condition by name.
+A condition acts through objects of three levels.  `Acting` is created once in a stage and holds the loaded faces.
+`Acting.placed` returns the `Loads` of a substep at the current position of the faces.  At each assembly `Loads` add
+forces to the residual and stiffness to the tangent.  The code of the step and of the momentum balance calls this
+interface only; it names no particular condition.
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ from mpm_dolfinx.points.parts import Parts
 T = TypeVar("T")
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
-"""Effects of conditions on the bodies, by quantity, such as "reactions", and by name of the condition."""
+"""Reactions, outflows and other results of the conditions: quantity, such as "reactions" -> condition -> values."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
-"""Quantities of the package's own conditions."""
+"""Quantities that the conditions of the package return."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
-"""Quantities of free tools."""
+"""Further quantities of free tools."""
 
 
 class FormsOf:
-    """Compiled forms of a scene's conditions; each kind of form is made at its first use.
+    """Compiled forms of the conditions of a scene.  Each kind of form is compiled at the first use.
 
     Parameters
     ----------
@@ -59,30 +60,26 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms that the class `make` returns for grid, u and further arguments; each class only once."""
+        """Return the forms `make(grid, u, ...)` with further arguments, compiled once for each class `make`."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
 
     @property
     def made(self) -> set[str]:
-        """Names of the form classes in use."""
+        """Names of the form classes compiled so far."""
         return {make.__name__ for make in self._made}
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Setting of the conditions in a stage.
+    """Data that all conditions of a stage share."""
 
-    sides: finds the faces of conditions; free (nodes, d): components without a fixing wall; materials: the scene's;
-    forms: the scene's compiled forms; conditions: all conditions of the stage, by name.
-    """
-
-    sides: Sides
-    free: NDArray[np.bool_]
-    materials: SceneMaterials
-    forms: FormsOf
-    conditions: Mapping[str, Any]
+    sides: Sides  # finds the faces of conditions
+    free: NDArray[np.bool_]  # components of nodes that no wall fixes (nodes, d)
+    materials: SceneMaterials  # of the scene
+    forms: FormsOf  # compiled forms of the scene's conditions
+    conditions: Mapping[str, Any]  # all conditions of the stage, by name
 
     @property
     def grid(self) -> Grid:
@@ -95,165 +92,161 @@ class Setting:
 
 
 class Place(NamedTuple):
-    """Place and time of a condition in a substep.
+    """Positions and times at which conditions act in a substep."""
 
-    cut: cut particle domains; points: present points; pieces: quadrature points, see `QuadratureData`; start, dt: start
-    and length of the step, s; t: end of the substep, s; before: outcome of the last step; inertia: whether the bodies
-    have inertia.
-    """
-
-    cut: CutDomains
-    points: MaterialPoints
-    pieces: Any
-    start: float
-    dt: float
-    t: float
-    before: Outcome
-    inertia: bool = False
+    cut: CutDomains  # particle domains cut by the grid
+    points: MaterialPoints  # material points at the start of the step
+    pieces: Any  # quadrature points, see `QuadratureData`
+    start: float  # start of the step, s
+    dt: float  # length of the step, s
+    t: float  # end of the substep, s
+    before: Outcome  # reactions, outflows and other results of the previous step
+    inertia: bool = False  # whether the bodies have inertia
 
 
 class Shares(NamedTuple):
-    """Time weights own and before of a substep, s, see `Substep`; gravity (d,), m/s^2, in it, None without."""
+    """Time weights and gravity of a substep, see `Substep`."""
 
-    own: float
-    before: float
-    gravity: NDArray[np.float64] | None
+    own: float  # weight of the rate in this substep, s
+    before: float  # weight of the rate in the previous substep, s
+    gravity: NDArray[np.float64] | None  # (d,), m/s^2, at the end of the substep; None without gravity
 
 
 class At(NamedTuple):
-    """Displacement increment u of the step, a local array, m, and the numbering of its unknowns."""
+    """Displacement increment u of the step (a local array), m, and the numbering of the unknowns."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
 
     @property
     def nodal(self) -> NDArray[np.float64]:
-        """u as an array (nodes, d), m."""
+        """Displacement increment as an array (nodes, d), m."""
         return self.u.reshape(-1, self.unknowns.dim)
 
 
 class Loads:
-    """Effect of a condition in a substep.  Methods that a subclass does not define have no effect.
+    """Forces and tangents of the conditions of one kind in a substep.  A method that is not overridden adds nothing.
 
-    Arrays b are local nodal forces, unrolled, N; entries at ghosts are added at their owners.
+    Arrays b are local, unrolled nodal forces, N.  Entries at ghost nodes are added at their owners.
     """
 
     linear: bool = True
     """Whether the tangent is independent of the displacement."""
     smooth: bool = True
-    """Whether the tangent of a substep may serve in the next one."""
+    """Whether the tangent of a substep may be used in the next substep."""
     varies: bool = False
     """Whether `loads` and `resists` depend on the displacement."""
     stiff: bool = False
-    """Whether there is a `penalty`."""
+    """Whether the condition adds a `penalty`."""
     holding: bool = False
-    """Whether bodies may be constrained in ways that `touching` does not report."""
+    """Whether the condition may constrain bodies in ways that `touching` does not report."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     touches: bool = False
-    """Whether bodies may separate from the condition."""
+    """Whether this is a contact with a tool or another body, from which bodies may separate."""
     key: Any = None
-    """Key of all dependences of the penalty except the positions of faces."""
+    """Key of everything on which the penalty depends, except for the positions of faces."""
 
-    def begun(self, shares: Shares, gone: Any) -> Loads:
-        """Return the loads for a substep with inertia; gone: result of `flown` in the previous substep."""
+    def begun(self, shares: Shares, earlier: Any) -> Loads:
+        """Return the loads for a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""
         return self
 
     def flown(self, at: At) -> Any:
-        """Return data of this solved substep for the next one, with inertia."""
+        """Return data of this converged substep that the next one needs, with inertia."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return powers at u on this process, W: dissipation by slip, and further power that `push` leaves out.
+        """Return two powers at u on this process, W: dissipation by slip, and further power not computed from `push`.
 
-        v: velocities, a local array, m/s.
+        `v` are nodal velocities, a local array, m/s.
         """
         return 0.0, 0.0
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add forces that are constant in the substep."""
+        """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the forces of the penalty that do not depend on u; they do not enter the scale of residuals."""
+        """Add the constant part of the penalty forces.  The scale of residuals leaves these forces out."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
 
     def resists(self, b: NDArray[np.float64]) -> None:
-        """Add resisting forces at u, with the sign of internal forces."""
+        """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that enter the scale of residuals together with internal forces."""
+        """Add forces at u that are scaled together with the internal forces."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the matrix of forces linear in u; walls: add the rows of components fixed by walls."""
+        """Add the matrix of forces that are linear in u.  `walls`: add the rows of components fixed by walls."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
-        """Return the power, W, of `pulls` and `penalty` at u on this process; v: velocities, a local array, m/s."""
+        """Return the power, W, of `pulls` and `penalty` at u on this process.  `v`: velocities, a local array, m/s."""
         return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the derivative at u of `resists`, less that of `loads`, without final assembly."""
+        """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from a residual of the unknowns or of fixed components; they do not enter its scale."""
+        """Subtract forces at u from the residual of unknowns or fixed components.  The scale leaves them out."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return forces at u, N, that add to the residual of the unknowns and to its scale; None without."""
+        """Return the inertia forces at u, N, or None.  They enter the residual and its scale."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the pattern of `coupling` beyond that of the cells; None if there is none."""
+        """Return a zero matrix with the entries that `coupling` adds to the pattern of the cells, or None."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
-        """Return minus the derivative of the forces in `push`, except for the part in `tangent`."""
+        """Return minus the derivative of the forces in `push`, without the part in `tangent`."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update the slipping set at u and, if sticks, let points return to stick; return whether the set changed."""
+        """Update which points slip at u, and return whether this changed.  `sticks`: points may return to stick."""
         return False
 
     def augment(self, at: At) -> bool:
-        """Update the multipliers at equilibrium; return whether forces changed."""
+        """Update the multipliers in equilibrium, and return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:
-        """Update contact positions at u; return whether the equilibrium changed."""
+        """Update the contact positions at u, and return whether equilibrium changed."""
         return False
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return an initial guess of displacements (nodes, d), m; None if there is none."""
+        """Return an initial guess of the displacements (nodes, d), m, or None."""
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the loads with the reactions of prescribed sides after a displacement u, m, of the nodes at rest."""
+        """Return loads that include the reactions of prescribed sides to a displacement u, m, in the initial state."""
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled local degrees of freedom (n,) on walls, and the forces (n,), N, on them not from the wall."""
+        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on them that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def touching(self) -> tuple | None:
-        """Return the initial constraints: cells (m,), cells of the deformable other side or None, positions and
-        directions (m, d).
+        """Return the initial constraints: cells (m,), cells of the other body (m,), positions and directions (m, d).
+
+        Cells of the other body are None if the body does not deform.
         """
 
     @property
     def held_cells(self) -> NDArray[np.int32]:
-        """Local cells with prescribed sides."""
+        """Local cells with sides whose displacement is prescribed."""
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), N, of forces in the local cells, given the errors without it."""
+        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` leave out this condition."""
         return of_cells
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error of forces in cells of other sides, N."""
+        """Rounding error of the forces, N, in the cells of other bodies in contact."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the effects on the bodies at u, by quantity and name of the condition."""
+        """Return the reactions and other results at u: quantity -> condition -> values."""
         return {}
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with the history of the condition."""
+        """Return the points with the updated history of the condition."""
         return points
 
     def ended(self, at: At) -> Loads:
@@ -261,35 +254,39 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d), m, after the step are so near that they follow the Q1 field alone."""
+        """Return which corners (n, 2^d, d), m, after the step are near a contact and follow the Q1 field alone."""
         return False
 
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return corners (n, 2^d, d), m, without penetration of forbidden regions; by default, small penetrations only.
+        """Return the corners (n, 2^d, d), m, moved out of forbidden regions.
 
-        free (n, 2^d, d): components that no other condition prescribes; everywhere: correct penetrations of any depth.
+        `free` (n, 2^d, d) are the components that no other condition prescribes.  By default only small penetrations
+        are corrected; with `everywhere`, penetrations of any depth.
         """
         return corners
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of domains whose prescribed faces keep their tracked corners."""
+        """Return new corners (m, 2^d, d), m, of domains whose prescribed faces keep their tracked corners.
+
+        `ids` and `volume` (m,), m^d, are the points and volumes of the domains; `tracked` are the tracked corners.
+        """
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points lie in forbidden regions after a step; before: points at its start."""
+        """Raise an error if points lie in forbidden regions after a step; `before` are the points at the start."""
 
 
 class Acting:
-    """The conditions of one kind in a stage.
+    """All conditions of one kind in a stage.
 
     Parameters
     ----------
     setting
-        Setting of the stage.
+        Data that all conditions of the stage share.
     """
 
     conditions: ClassVar[tuple[type, ...]] = ()
@@ -301,23 +298,23 @@ class Acting:
     linear: bool = True
     """Whether the tangent is independent of the displacement."""
     surfaces: Sequence[Surface] = ()
-    """Loaded faces; all are cut together."""
+    """Loaded faces; the grid cuts all of them together."""
     outside: Surface | None = None
-    """Faces that tools may touch."""
+    """Faces that tools may touch; None without tools."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
-    """(condition, prescribed faces, prescribed axes)."""
+    """Prescribed displacements: (condition, faces, prescribed axes)."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
         raise NotImplementedError
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if the stage cannot begin at this position."""
+        """Raise an error if the stage cannot start from the current positions."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the initial history of n points: condition -> name of the data -> values."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outcome before the first step, filled with this value."""
+        """Return the results of the conditions before the first step, filled with this value."""
         return {}

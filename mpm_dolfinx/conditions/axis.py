@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The axis of revolution of axisymmetric scenes: it is fixed, and a hole around it must be a cell wide."""
+"""The axis of revolution of axisymmetric scenes: radial displacements vanish, and holes must be a cell wide."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
 def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the walls and their fixed components, including the radial one of the axis."""
+    """Return the fixed components of each wall, with the radial component on the axis."""
     left = walls.get("left", "") if isinstance(walls, Mapping) else None
     if not grid.has_axis or not isinstance(left, str) or "x" in left:
         return walls
@@ -22,14 +22,9 @@ def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for invalid axisymmetric scenes, and warn about narrow holes around the axis."""
+    """Raise an error for invalid axisymmetric scenes.  Warn about narrow holes around the axis."""
     if grid.axisymmetric and quadrature == "point":
         raise ValueError("quadrature 'point': must be domain in axisymmetry")
-    _warn_narrow_hole(grid, bodies)
-
-
-def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Warn about a hole within the first cells from the axis, as their nodes on the axis are fixed."""
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])
@@ -38,11 +33,11 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
     near = np.flatnonzero(inner < h * (1 - NEAR))
     row = grid.index(x[near].mean(axis=1))[:, 1]
     touches = np.zeros(grid.shape[1] + 2, dtype=bool)
-    for k in range(3):  # an inclined surface starts off the axis in the next row
+    for k in range(3):  # an inclined surface leaves the axis in the next row of cells
         touches[row[inner[near] <= NEAR * h] + k] = True
     hole = near[~touches[row + 1]]
-    if len(hole):
+    if len(hole):  # nodes of the first cells lie on the axis, and are fixed
         k = hole[inner[hole].argmin()]
         what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves like "
-        what += "that of a solid core; take smaller cells, or a grid that begins at a radius > 0"
+        what += "that of a solid core; use smaller cells, or a grid that begins at a radius > 0"
         warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), h)

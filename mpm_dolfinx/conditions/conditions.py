@@ -2,18 +2,19 @@
 """Conditions on sides of bodies: tractions, pressures, displacements, plates, drained sides, prescribed flux, rain.
 
 Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y),
-before any map.  Meshes have their own names (`from_mesh`).  A side moves with its body.  Faces in contact with another
-body at seeding are not part of it.  Regions and X are reference positions, before all maps (`mapped`); reference areas
+as before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes faces that
+touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).  Reference areas
 refer to the seeded shape, after the maps.
 
-A new kind of condition is a class of this form in its own file.  It has a method `acting` for loads on the momentum
-(`conditions/acting.py`), or `feeding` for the fluid (`flow/feeding.py`).
+A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
+balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-Values may be functions of time t, reference positions X and present positions x, called by these parameter names; see
+Values may be functions of time t, reference positions X and current positions x.  The parameter names decide; see
 `validation`.
 
-An invalid condition raises a ValueError when it, a scene or a stage is made.  Invalid values of a function do so in the
-step that needs them.  A condition equals only itself, because values and regions may be arrays or functions.
+An invalid condition raises a ValueError when the condition, a scene or a stage is created.  An invalid value of a
+function raises the error in the step that needs the value.  A condition is equal only to itself, because values and
+regions may be arrays or functions.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """Base of conditions; it copies lists and arrays, which nobody changes afterwards.
+    """Base class of conditions.  Lists and arrays are copied, so that later changes to them have no effect.
 
-    name: name of its results; by default its kind and side, such as "displacement_top".
+    `name` is the name of its results, by default kind and side, such as "displacement_top".
     """
 
     name: str | None = field(default=None, kw_only=True, repr=False)
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": NAMES}
-    """Attributes that may be functions, and their allowed parameters."""
+    """Attributes that may be functions, and the allowed parameters of each."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -51,7 +52,7 @@ class Condition:
                 check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
     def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
-        """Return an attribute's value at time t (s), see `validation.given`."""
+        """Return the value of an attribute at time t (s), see `validation.given`."""
         what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
         return given(what, getattr(self, name), t, *more, among=among, **options)
 
@@ -64,18 +65,17 @@ class Traction(Condition):
     ----------
     side
         Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y), or a
-        name from a mesh.  The condition applies to all bodies with a side of this name.
-    value : (d,) or number, or callable (t, X, x) -> (d,) or number, or one of these a place, Pa
-        Force per reference area.  A number acts along the outward normal at the start of the step; a negative one
-        presses.  Several tractions on one face add up.
+        name from a mesh.  The condition applies to all bodies that have a side with this name.
+    value : (d,) or number, or callable (t, X, x) -> (d,) or number, or one of these for each place, Pa
+        Force per reference area.  A number acts along the outward normal at the start of the step; a negative number
+        is compressive.  Several tractions on the same face add up.
     region : ((d,), (d,)), m
-        Lower and upper corner of a box of reference positions that limits the traction.  A face partly inside counts
-        with that part.
+        Lower and upper corner of a box of reference positions.  The traction acts on the parts of faces inside the box.
 
     Raises
     ------
     ValueError
-        From the scene or the step: no point has the side, or the value is invalid.
+        From the scene or the step: no point lies on the side, or the value is invalid.
     """
 
     side: str
@@ -89,18 +89,19 @@ class Traction(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Pressure(Condition):
-    """Pressure on a side of the bodies that follows the surface: normal to it, per present area.
+    """Pressure on a side of the bodies that follows the surface: normal to the surface, per current area.
 
-    It adds to tractions, and acts on skeleton and pore fluid together.  `Drained` prescribes the pore pressure of water
-    that also enters the pores.  A uniform pressure has a potential if its surface is closed, or ends at walls that fix
-    its edges.  Otherwise the tangent is unsymmetric (LU, FGMRES), and the stability of dry equilibria is not checked.
+    The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
+    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is
+    closed, or ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the
+    stability of dry equilibria is not checked.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     value : float or callable (t, X, x) -> float, Pa
-        Finite; positive: presses, negative: pulls.  Functions of position give an unsymmetric tangent.
+        Finite; positive for compression.  Functions of position give an unsymmetric tangent.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -123,23 +124,23 @@ class Pressure(Condition):
 class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
-    The resisting traction is velocity times the impedance of the material, rho c_p along the normal and rho c_s across
-    it.  Waves along the normal are absorbed completely, oblique waves reflect a few per cent.  A side that was fixed
-    in a stage without inertia keeps its tractions.
+    The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
+    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few
+    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     incoming : (d,) or callable t (s) -> (d,), m/s
-        Particle velocity of an incoming wave alone, along the normal; the motion of a free surface is twice as large.
+        Particle velocity of an incoming wave along the inward normal.  A free surface would move twice as fast.
     region : ((d,), (d,)), m
         As for `Traction`.
 
     Raises
     ------
     ValueError
-        From the scene: bodies without inertia, or with inertia before the side became quiet; no point has the side;
+        From the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the side;
         another `Quiet` on the same part of a face.
     """
 
@@ -155,16 +156,16 @@ class Quiet(Condition):
 
 @dataclass(frozen=True, eq=False)
 class OnSide(Condition):
-    """User-defined UFL term on a side of the bodies, such as springs, dashpots or loads that depend on the motion.
+    """User-defined UFL term on a side of the bodies, for example springs, dashpots or loads that depend on the motion.
 
-    It belongs to the `terms` of the scene, and acts in all stages.
+    An `OnSide` is an element of the scene's `terms`, and acts in all stages.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     term
-        Function as in `terms`, see `user_functions`, whose `points` are quadrature points of the side: `points.dx` is
+        Function as in `terms`, see `user_functions`.  Its `points` are quadrature points on the side: `points.dx` is
         the area measure and `points.normal` the outward normal, both at the start of the step.
     region : ((d,), (d,)), m
         As for `Traction`.
@@ -172,7 +173,7 @@ class OnSide(Condition):
     Raises
     ------
     ValueError
-        From the scene: an invalid function, or no point has the side.
+        From the scene: the function is invalid, or no point lies on the side.
     """
 
     side: str
@@ -183,21 +184,21 @@ class OnSide(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """User-defined UFL term in the storage of fluid: a source or sink in the bodies.
+    """User-defined UFL term in the fluid balance: a source or sink in the bodies.
 
-    It belongs to the `terms` of the scene, and acts in all stages.
+    A `Source` is an element of the scene's `terms`, and acts in all stages.
 
     Parameters
     ----------
     term
-        Function with a test function q of the pressure, see `user_functions`; a positive term adds volume, 1/s.
+        Function of a test function q of the pressure, see `user_functions`.  A positive term adds fluid, 1/s.
     """
 
     term: Callable
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return the user's terms of the momentum balance, and the terms of the fluid storage."""
+    """Return the user's terms of the momentum balance, and the terms of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -205,41 +206,37 @@ def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Call
 
 
 class Through(NamedTuple):
-    """Flow condition on a side at its quadrature points, each () or (m,).
+    """Flow condition at the quadrature points of a side; each value is () or (m,)."""
 
-    pressure: outside pressure, Pa, nan for a prescribed flux alone; flux: into the body, m/s; one_way: no inflow;
-    driest: lowest pressure with the prescribed flux, Pa, nan if pressures do not limit the flux.
-    """
-
-    pressure: NDArray[np.float64] | float
-    flux: NDArray[np.float64] | float
-    one_way: NDArray[np.bool_] | bool
-    driest: NDArray[np.float64] | float = np.nan
+    pressure: NDArray[np.float64] | float  # pore pressure outside, Pa; nan if only the flux is prescribed
+    flux: NDArray[np.float64] | float  # prescribed flux into the body, m/s
+    one_way: NDArray[np.bool_] | bool  # whether fluid can only leave the body
+    driest: NDArray[np.float64] | float = np.nan  # lowest pressure, Pa, with the prescribed flux; nan: no limit
 
 
 @dataclass(frozen=True, eq=False)
 class Drained(Condition):
-    """Side of the bodies with prescribed pore pressure; it moves with them.
+    """Side of the bodies with a prescribed pore pressure.  The side moves with the bodies.
 
-    The simulation's `outflows` have the flow through it.
+    `outflows` of the simulation are the flow through the side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     pressure : float or callable (t, X, x) -> float, Pa
-        Outer pore pressure, finite; below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
+        Pore pressure outside, finite.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
     region : ((d,), (d,)), m
-        Box of reference positions that limits the drained faces.
+        Box of reference positions; the parts of faces inside it are drained.
     seepage
-        Seepage face: at outer pressures <= 0, as above a water level, water leaves but does not enter.  The pore
-        pressure there is at most the outer one, and lower only without flow.
+        Seepage face: where the outside pressure is <= 0, as above a water level, water can leave but not enter.  The
+        pore pressure there is at most the outside pressure, and lower only where no water leaves.
 
     Raises
     ------
     ValueError
-        The pressure is not finite.  From the scene: no fluid, no point has the side, or another `Drained` or `Inflow`
-        on the same part of a face.
+        The pressure is not finite.  From the scene: no fluid; no point on the side; another `Drained` or `Inflow` on
+        the same part of a face.
     """
 
     side: str
@@ -265,7 +262,7 @@ class Drained(Condition):
 
 
 class Flux(Condition):
-    """Base of conditions with a flux (m/s) through a side, a number or a function of t, X, x."""
+    """Base class of conditions with a flux (m/s) through a side: a number or a function of t, X, x."""
 
     side: str
     flux: float | Callable[..., ArrayLike]
@@ -283,16 +280,16 @@ class Flux(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Inflow(Flux):
-    """Side of the bodies with prescribed inflow of fluid.
+    """Side of the bodies with a prescribed inflow of fluid.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Inflow as a volume at zero pressure per present area and time, finite; negative: outflow.
+        Inflow per current area and time, as a volume at zero pressure.  Finite; negative for outflow.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the faces.
+        Box of reference positions; fluid enters through the parts of faces inside it.
 
     Raises
     ------
@@ -311,29 +308,29 @@ class Inflow(Flux):
 
 @dataclass(frozen=True, eq=False)
 class Rain(Flux):
-    """Side of the bodies with rain, or with evaporation, limited by the capacity of the soil.
+    """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
 
-    Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates until the
-    pressure falls to `driest`.  Seepage leaves through the side too.  The simulation's `outflows` have the flow through
-    the side, and `simulation.outcome("runoff")` the run-off, m^3/s (m^2/s in plane strain).  Volumes since the
-    condition began, m^3 (m^2): `outcome("flowed")`, out of the body through all open sides; `outcome("ran_off")`, with
-    the seepage here; `outcome("ponded")`, the pond on the side.
+    Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates at the
+    given rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.  `outflows` of
+    the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s (m^2/s in plane
+    strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")`: outflow through
+    all open sides; `outcome("ran_off")`: run-off and seepage here; `outcome("ponded")`: water ponded on the side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Rain per present area of the side, as a volume at zero pressure, finite; negative: potential evaporation.
+        Rain per current area of the side, as a volume at zero pressure.  Finite; negative for potential evaporation.
         Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
-        Largest pressure of ponded water, Pa, >= 0: depth times unit weight.  A side has one pond of uniform depth.  It
-        fills before water runs off, and infiltrates or evaporates later.
+        Largest pressure of ponded water, Pa, >= 0: depth times unit weight.  The pond has one depth for the whole side.
+        Water runs off once the pond is full; ponded water infiltrates or evaporates later.
     driest
-        Lowest pressure at the side, Pa, < 0 and finite: the suction of the air.  By Kelvin's equation -1e7 Pa is in
-        equilibrium with air of 93 % humidity at 20 °C.
+        Lowest pressure at the side, Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By Kelvin's
+        equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the faces.
+        Box of reference positions; rain falls on the parts of faces inside it.
 
     Raises
     ------
@@ -359,10 +356,10 @@ class Rain(Flux):
 
 @dataclass(frozen=True, eq=False)
 class Tied(Condition):
-    """Two opposite sides of a box that move alike: ground of finite width that answers as if it went on uniformly.
+    """Two opposite sides of a box with equal displacements, as if the ground repeated itself beyond the box.
 
-    Displacements at equal heights are equal, forces equal and opposite, at rest and with inertia.  A wave that leaves
-    the box on one side enters it on the other.  Water does not flow through the sides.
+    Displacements at equal heights are equal, forces are equal and opposite, with and without inertia.  A wave that
+    leaves the box at one side enters at the other.  No water flows through these sides.
 
     Parameters
     ----------
@@ -372,7 +369,7 @@ class Tied(Condition):
     Raises
     ------
     ValueError
-        From the scene: the sides are not opposite, or have other faces.
+        From the scene: the sides are not opposite, or their faces differ.
     """
 
     side: str
@@ -384,65 +381,65 @@ class Tied(Condition):
 RIGIDITY = 1e4
 """Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
 HOLD = 3e2
-"""Penalty stiffness for cell means of prescribed displacements, in units of (modulus by `holding`) / (cell size).
+"""Penalty stiffness for cell means of prescribed displacements, in units of (modulus from `holding`) / (cell size).
 
-The error of the displacement is (change of traction in the step, except by rotation) / (modulus) x cell size / HOLD.
-It does not accumulate, because each step measures it from the prescribed position.  Multipliers remove it where a body
-resists much more stiffly, see `HoldLoads.augment`.
+The displacement error is (change of traction in the step, except by rotation) / (modulus) x (cell size) / HOLD.  It
+does not accumulate, because each step measures it from the prescribed position.  Where a body is much stiffer than the
+penalty, multipliers remove the error, see `HoldLoads.augment`.
 
-Plateau (soil): halved 5.9e-05, doubled 2.0e-05, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 5.9e-05, twice by 2.0e-05, finer cells by 3.0e-02.
 """
 WEAK = 8.0
 """Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).
 
-Plateau (soil): halved 5.0e-06, doubled 7.9e-06, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 5.0e-06, twice by 7.9e-06, finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Fraction of the elastic modulus for the penalty of laws with a state, because yielding soil is much softer.
+"""Factor on the elastic modulus in the penalty of laws with a state, because yielding soil is much softer.
 
-Plateau (soil): halved 6.5e-05, doubled 1.9e-05, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 6.5e-05, twice by 1.9e-05, finer cells by 3.0e-02.
 """
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
-    """Return the reference modulus of a side, Pa: the oedometric modulus, at most 4G, its value for nu = 1/3."""
+    """Return the reference modulus of a side, Pa: the oedometric modulus, but at most 4G (its value at nu = 1/3)."""
     return np.minimum(material.oedometric, 4 * material.shear)
 
 
 def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, Pa, of the penalty for prescribed displacements.
 
-    A Q1 field of constant cell volumes cannot follow a curved side.  The penalty turns the difference into pressure, so
-    it must not be stiff relative to the shear stiffness.  In an undrained cavity in soil, 3e2 (lambda + 2G)
-    gives up to 1.9 times the exact pressure, and 30 times 4G gives 1.01 times.
+    A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
+    difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity,
+    3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and 30 times 4G gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
 
 @dataclass(frozen=True, eq=False)
 class Displacement(Condition):
-    """Side of the bodies with prescribed displacement: a footing, a moving clamp, a transported body.
+    """Side of the bodies with a prescribed displacement: a footing, a moving clamp, a transported body.
 
-    Its forces are `reactions` of the simulation.
+    The forces on the side are in `reactions` of the simulation.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement since the start, or since a stage reset it, at reference positions X (m, d).  The map of a bent
-        body converts X to seeded positions.  All d components are given, also the free ones.
+        Displacement since the start, or since a stage reset it, at reference positions X (m, d).  For a mapped body,
+        the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the condition.  The last prescribed node carries half a cell beyond it.
-        If the box ends within a side, a cell that it covers by at most one half is therefore free.
+        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell
+        outside the box.  If the box covers at most half of its last cell, the far node of that cell is not prescribed.
 
     Raises
     ------
     ValueError
-        From the scene or the step: no point has the side; invalid value or components; a wall fixes a moving component;
-        or another `Displacement` prescribes a component on the same part of a face, or another value at a common edge.
+        From the scene or the step: no point on the side; invalid value or components; a moving component that a wall
+        fixes; another `Displacement` of a component on the same part of a face, or with another value at a common edge.
     """
 
     side: str
@@ -465,7 +462,7 @@ class Displacement(Condition):
 
 @dataclass(frozen=True, eq=False)
 class _OfPlate(Traction):
-    """Uniform traction of a plate, whose errors name the plate."""
+    """Uniform traction of a plate.  Its error messages name the plate."""
 
     def at(self, t: float, dim: int, side: Places | None = None) -> NDArray[np.float64]:
         return self.value(t)
@@ -475,23 +472,23 @@ class _OfPlate(Traction):
 class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies: all faces have the same displacement normal to the side.
 
-    A penalty on the slope of the faces, kappa/2 int |grad_t x_n|^2 dA, keeps the plate flat.  Uniform displacements are
-    free, so the plate carries the total force exactly.  It does not tilt.
+    A penalty on the slope of the faces, kappa/2 int |grad_t x_n|^2 dA, keeps the plate flat and prevents tilting.  The
+    penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters
     ----------
     side
-        Side of the bodies, as for `Traction`.  Its seeded faces are connected, in one plane normal to an axis.
+        Side of the bodies, as for `Traction`.  Its seeded faces must be connected, in one plane normal to an axis.
     force : float or callable t (s) -> float, N (N/m in plane strain)
-        Total force on the side, in axisymmetry of the whole revolution; positive: presses, negative: pulls.
+        Total force on the side, positive for compression.  In axisymmetry: the force on the whole circumference.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the plate.
+        Box of reference positions; the plate lies on the faces inside it.
 
     Raises
     ------
     ValueError
-        The force is not finite.  Raised by the scene or the step: no points lie on the side, or its faces are not
-        connected or not coplanar (define one plate, with a region, for each part).
+        The force is not finite.  From the scene or the step: no point on the side; faces that are not connected or not
+        coplanar (define one plate, with a region, for each part).
     """
 
     side: str
@@ -505,7 +502,7 @@ class RigidPlate(Condition):
             numbers("RigidPlate: force", self.force)
 
     def traction(self, area: float, inward: NDArray[np.float64]) -> Traction:
-        """Return the uniform traction of the plate along a direction (d,) on its reference area, m^(d-1)."""
+        """Return the traction of the plate: the force along `inward` (d,) divided by the reference area, m^(d-1)."""
 
         def even(t: float) -> NDArray[np.float64]:
             return inward * self._given("force", t) / area
@@ -514,13 +511,13 @@ class RigidPlate(Condition):
 
 
 def facing(faces: Surface) -> tuple[int, int]:
-    """Return the axis and the sign of the outward normal of seeded faces."""
+    """Return the axis and the sign of the mean outward normal of seeded faces."""
     outward = faces.outward.sum(axis=0)
     axis = int(np.abs(outward).argmax())
     return axis, int(np.sign(outward[axis]))
 
 
 def inward(faces: Surface) -> NDArray[np.float64]:
-    """Return the inward direction (d,) of seeded faces, along an axis."""
+    """Return the inward unit vector (d,) of seeded faces, along the axis of the mean normal."""
     axis, sign = facing(faces)
     return -sign * np.eye(faces.outward.shape[1])[axis]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of conditions, which identify their results."""
+"""Names of conditions, by which their results are found."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ T = TypeVar("T")
 
 
 class ByName(dict[str, T]):
-    """Values of conditions by their names, in the order of the conditions."""
+    """Values of conditions.  Keys are the names of the conditions, in the order of the conditions."""
 
     @property
     def array(self) -> NDArray[np.float64]:
-        """All values (conditions, ...) as one array; shape (0,) without conditions."""
+        """All values (conditions, ...) as one array; shape (0,) if there are no conditions."""
         return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:
-        """Raise a KeyError for an unknown name, such as a position."""
+        """Raise a KeyError for an unknown name, or for an index in place of a name."""
         raise KeyError(f"{name!r}: must be the name of a condition: {', '.join(map(repr, self)) or 'there is none'}")
 
 
 def named(conditions: Sequence[Any]) -> dict[str, Any]:
-    """Return conditions by name: the given name, or kind and side, made unique by a number.
+    """Return the conditions by name.  A default name consists of kind and side, and if necessary a number.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
 
 
 def _default(condition: Any) -> str:
-    """Return the default name of a condition: its kind, and its side."""
+    """Return the default name of a condition, from its kind and side."""
     kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(condition).__name__).lower()
     side = getattr(condition, "side", None)
     return kind if side is None else f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', str(side))}"

@@ -16,27 +16,27 @@ ALLOWED = "two columns of at least two rows: increasing times, s, and finite val
 
 
 class Record:
-    """Recorded motion along a direction: a function of time (s) that returns the displacement (d,), m.
+    """Recorded motion along a direction, as a function of time (s) that returns the displacement (d,), m.
 
-    The record is linear between its times, with exact integrals.  Motion is zero before the first time, and has
-    constant velocity after the last one.
+    Recorded values are interpolated linearly in time and integrated exactly.  The motion is zero before the first
+    recorded time.  After the last one the velocity is constant.
 
     Parameters
     ----------
     record : file, or (n, 2)
-        Two columns, times, s, and values.  Files may use blanks or commas, and # for comments.
+        Two columns: times, s, and values.  Columns of a file are separated by blanks or commas; # starts a comment.
     direction : (d,)
-        Direction of the motion; its length scales the values: (9.81, 0) for a record in g.
+        Direction of the motion.  Its length multiplies the values: (9.81, 0) for a record in units of g.
     quantity
         Recorded quantity: "acceleration", m/s^2, or "velocity", m/s.
     at_rest
-        Correct the accelerations by a linear function of time, so that the motion ends at rest in its first position.
-        Without it, a record with a non-zero integral leaves a final velocity.
+        Correct the accelerations by a linear function of time, so that the motion ends at its initial position with
+        zero velocity.  Without the correction, a record with a non-zero integral ends with a velocity.
 
     Raises
     ------
     ValueError
-        Values that are not finite, times that do not increase, or fewer than two rows.
+        Values are not finite, times do not increase, or there are fewer than two rows.
     OSError
         The file cannot be read.
     """
@@ -85,17 +85,17 @@ class Record:
         return self._within(self._of[0], t) * (t <= self.end)
 
     def _within(self, value: PPoly, t: float) -> NDArray[np.float64]:
-        """Return a quantity (d,) along the direction: zero before the record, constant after it."""
+        """Return a quantity (d,) at time t along the direction: zero before the record, the last value after it."""
         return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
 
 
 def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> PPoly:
-    """Return the piecewise linear interpolant of values (n,) at times (n,), s."""
+    """Return the piecewise linear interpolant of values (n,) at times t (n,), s."""
     return PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 
 def _read(record: str | os.PathLike) -> NDArray[np.float64]:
-    """Return the columns of a file."""
+    """Return the columns of a file as an array (n, 2)."""
     file = path("Record", record)
     with on_disk(f"Record: {file}", "a file that can be read"):
         text = file.read_text()

@@ -21,14 +21,14 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Sides:
-    """Finds the faces on which a condition acts; conditions on the same faces share one object.
+    """Finder of the faces on which a condition acts.  Conditions on the same faces share one `Surface`.
 
     Parameters
     ----------
     grid, bodies
         Background grid and all bodies of the scene.
     present
-        Which bodies are present.
+        Which bodies are active in the stage.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
@@ -38,7 +38,7 @@ class Sides:
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:
-        """Return the faces of a condition's side and region; ValueError if there are none."""
+        """Return the faces of a condition's side and region; raise ValueError if there are none."""
         found = self._of(condition.side, condition.region)
         if not len(found):
             where = " in the region" if condition.region is not None else ""
@@ -59,31 +59,32 @@ class Sides:
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
-        """Return the faces of a prescribed displacement, without cells that its region covers by at most one half.
+        """Return the faces of a prescribed displacement, without cells that the region covers by at most one half.
 
-        The last prescribed node carries half a cell beyond it.  A region that covers at most half of its last cell
-        therefore ends at this cell; in a direction inclined to the grid it ends half a cell earlier.  This concerns
-        ends of regions at which the side continues and no other condition prescribes the same components.
+        The last prescribed node also moves half a cell outside the region.  If the region covers at most half of its
+        last cell, the faces therefore end at the inner side of this cell.  On a side inclined to the grid, they end
+        half a cell before the end of the region.  This applies only where the side continues outside the region and no
+        other condition prescribes the same components there.
 
         Parameters
         ----------
         condition
             The prescribed displacement.
         others
-            Other prescribed displacements with common components.
+            Other prescribed displacements of the same components.
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X
         if not np.isfinite(box).any():
             return faces
         side = self._of(condition.side, None)
-        own = np.broadcast_to(self.grid.copy(side.id) == self.grid.copy(faces.id[:1]), len(side))  # of its group
+        own = np.broadcast_to(self.grid.copy(side.id) == self.grid.copy(faces.id[:1]), len(side))  # same contact group
         size = X[:, 1].max(axis=0) - X[:, 0].min(axis=0)
         near = SAME * size.max() + rounding(X)
         neighbours = [self.of(other).X for other in others]
 
         def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
-            """Return which boxes (m, 2, d) are adjacent to the faces and reach across the coordinate x of an axis."""
+            """Return which boxes (m, 2, d) are adjacent to the faces and contain the coordinate x along an axis."""
             across = np.arange(d) != axis
             low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
             beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
@@ -102,9 +103,9 @@ class Sides:
         return shorter if len(shorter) else faces  # the region is narrower than a cell
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return the length, m, of the free end of a region that ends at x along an axis of reference positions.
+        """Return the length, m, to cut off a region that ends at coordinate x along an axis of reference positions.
 
-        at_end (m,): which faces of the side reach across x.  See `held`.
+        `at_end` (m,) tells which faces of the side contain x; `sign` is the direction out of the region.  See `held`.
         """
         faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
@@ -124,7 +125,7 @@ class Sides:
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 
     def around(self, bodies: Sequence[int]) -> Surface:
-        """Return the faces on all sides of some present bodies, including faces in contact with other bodies."""
+        """Return all surface faces of some active bodies, including faces in contact with other bodies."""
         key = ("", np.array(bodies).tobytes())
         if key not in self._found:
             there = [bool(here) and i in bodies for i, here in enumerate(self.present)]
@@ -132,14 +133,14 @@ class Sides:
         return self._found[key]
 
     def all(self) -> Surface:
-        """Return the faces on all sides of all contact groups, including faces between groups, which may separate."""
+        """Return all surface faces of all contact groups, including faces between groups, which may separate."""
         start = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
         copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
 
 def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return values of user functions on this process; an error on one process is raised on all."""
+    """Return the values of user functions on this process.  An error on one process is raised on all processes."""
     message, value = "", None
     try:
         value = ask()
@@ -151,12 +152,12 @@ def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np
 
 
 def on_side(patches: Patches, points: MaterialPoints) -> Places:
-    """Return the function that gives the positions of quadrature points on a side to user functions."""
+    """Return the function that gives user functions the reference or current positions of points on a side."""
     return lambda name: patches.X if name == "X" else patches.now(points) + patches.base
 
 
 def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
+    """Send rows (cells, positions, values) to the owners of the cells; return local cells, positions and values."""
     empty = (np.empty(0, dtype=np.int64), np.empty((0, grid.dim)), np.empty((0, width)))
     parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
     travel = Exchange(grid.comm, grid.owner(parts[0]))
@@ -165,14 +166,14 @@ def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, ND
 
 
 def check_apart(one, faces: Surface, other, others: Surface) -> None:
-    """Raise an error if two mutually exclusive conditions share a part of a face."""
+    """Raise an error if two conditions that exclude each other act on the same part of a face."""
     first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
     a, b = ranges(first, stop - first)  # all pairs of faces of the same domain
     same = faces.face[a] == others.face[b]
     a, b = a[same], b[same]
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
     size = faces.X[a, 1] - faces.X[a, 0]
-    common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # or flat along the axis
+    common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # or no extent along an axis
     both = np.flatnonzero(common.all(axis=1))
     if len(both):
         x = (low[both[0]] + high[both[0]]) / 2
@@ -180,9 +181,9 @@ def check_apart(one, faces: Surface, other, others: Surface) -> None:
 
 
 def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.float64]:
-    """Return the common corners (k, d), m, of faces of two conditions, at reference positions.
+    """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
 
-    A mapped body has common corners with itself only.
+    A mapped body has no common corners with other bodies.
     """
 
     def corners(faces: Surface) -> NDArray[np.float64]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unit weight of the fluid, which converts conductivity to mobility, by the scene's gravity in any units."""
+"""Unit weight of the fluid, from the gravity of the scene; it converts hydraulic conductivity to mobility."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Fluid
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 
-WEIGHS = 5e-3  # relative difference of unit weights of water, or of gravities, without a warning
+WEIGHS = 5e-3  # relative difference between unit weights of water, or between gravities, that gives no warning
 DENSITIES = (500.0, 2000.0)  # kg/m^3: from oils to brines
 SOFTEST = 1e5  # Pa: bulk modulus of a gas at atmospheric pressure.  Source: exact, by Boyle's law
 
@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid with the gravity of its scene, m/s^2, for the conversion of conductivities, if it is known."""
+    """Return the fluid with the magnitude of the scene's gravity, m/s^2, if constant, to convert its conductivity."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -34,19 +34,19 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure; the pore fluid gives its unit weight if it has none."""
+    """Return a water pressure.  If it has no unit weight, it gets the unit weight of the pore fluid."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 
 
 def waters(conditions: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the water pressures of conditions, labelled by their sides."""
+    """Return the water pressures of the conditions, each with a label that names the side."""
     each = ((one, value) for one in conditions.values() for value in getattr(one, "__dict__", {}).values())
     return [(f"water at {one.side!r}", value) for one, value in each if hasattr(value, "unit_weight")]
 
 
 def with_weight(condition: T, fluid: Fluid | None) -> T:
-    """Return a condition with the unit weights of its water pressures set, see `weighed`."""
+    """Return a condition whose water pressures have unit weights, see `weighed`."""
     new = {
         name: weighed(value, fluid)
         for name, value in getattr(condition, "__dict__", {}).items()
@@ -56,7 +56,7 @@ def with_weight(condition: T, fluid: Fluid | None) -> T:
 
 
 def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
-    """Warn about a fluid in a scene without gravity that is not a liquid in SI units, as it affects its unit weight."""
+    """Warn about a fluid that is no liquid in SI units, if no gravity is given from which its unit weight follows."""
     if fluid.gravity is not None or gravity is not None:
         return
     if not DENSITIES[0] <= fluid.density <= DENSITIES[1] or fluid.bulk < SOFTEST:
@@ -70,8 +70,31 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
         )
 
 
+def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
+    """Warn about each water level whose unit weight differs from that of the pore fluid.
+
+    In a dry scene, warn about each level whose unit weight is not that of water under the scene's gravity.
+
+    Parameters
+    ----------
+    levels
+        Name and water pressure of each level.
+    """
+    g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
+    if fluid is None:
+        levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
+        own, of = 1000 * g, "water under the scene's gravity"
+    else:
+        own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
+    weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
+    for name, weight in sorted(weights):
+        if abs(weight - own) > WEIGHS * max(weight, own):
+            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
+            warn(comm, ConditionWarning, f"{what}: at one level they are not in equilibrium", name, weight, of, own)
+
+
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the magnitude of a constant gravity, m/s^2, that differs from the gravity of the fluid's conductivities.
+    """Return a constant gravity, m/s^2, that differs from the one with which conductivities are converted, else None.
 
     Parameters
     ----------

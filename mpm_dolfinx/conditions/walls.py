@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Wall forces on the bodies, from the forces on fixed components of nodes."""
+"""Forces of the walls on the bodies, from the forces on fixed components of nodes."""
 
 from __future__ import annotations
 
@@ -14,33 +14,30 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 def wall_forces(
     grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the forces (d,), N, of all walls by name; collective.
+    """Return the force (d,), N, of each wall by name; all processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to it takes the force; otherwise they share it evenly.
+    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of them is
+    normal to it, they share the force evenly.
     The axis of revolution has no area, so its radial force is zero.
 
     Parameters
     ----------
     walls
-        Walls and their fixed components.
+        Names of the walls, and the components that each fixes.
     dofs : (n,)
-        Unrolled local degrees of freedom, possibly repeated; free ones are ignored.
+        Local degrees of freedom, unrolled; repetitions are allowed.  Free ones are ignored.
     forces : (n,), N
-        Forces on them.
+        Forces on these degrees of freedom.
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)
-    place, letter = grid.nodes_along(grid.node_x[node]), np.array(list("xyz"))[component]
+    place, fixed = grid.nodes_along(grid.node_x[node]), [[a in walls.get(name, "") for a in "xyz"] for name in sides]
     across = np.array([component == axis for axis, _ in sides.values()])
-    holds = np.array(
-        [
-            (place[:, axis] == end * grid.shape[axis]) & np.isin(letter, list(walls.get(name, "")))
-            for name, (axis, end) in sides.items()
-        ]
-    )
+    holds = np.array([place[:, axis] == end * grid.shape[axis] for axis, end in sides.values()])
+    holds &= np.array(fixed)[:, component]
     holds = np.where((holds & across).any(axis=0), holds & across, holds)
     shares = holds / np.maximum(1, holds.sum(axis=0)) * forces
-    out = grid.comm.allreduce(np.stack([sum_by(component, share, d) for share in shares]))
+    out = grid.comm.allreduce(sum_by(component, shares, d))
     if grid.has_axis:
         out[0, 0] = 0.0
     return dict(zip(sides, out, strict=True))

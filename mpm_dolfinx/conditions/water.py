@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Free water against a side of the bodies: pressure and head below its level, a seepage face above."""
+"""Free water at a side of the bodies: hydrostatic pressure below the water level, a seepage face above."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ def water(
     region: Region | None = None,
     unit_weight: float | None = None,
 ) -> tuple[Pressure, Drained]:
-    """Return the two conditions of still water at a side; a scene needs both.
+    """Return two conditions, which both belong in the scene, for still water at a side.
 
-    Below the level, hydrostatic pressure acts on the surface and on the pore fluid.  Above it the side is a seepage
-    face.  Both are updated with the motion of the side in each step.
+    Below the level, hydrostatic pressure acts on the surface and on the pore fluid.  Above the level, the side is a
+    seepage face.  Both follow the motion of the side in each step.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     level : float or callable t (s) -> float, m
-        Height of the free surface along the last axis; finite.
+        Height of the water level along the last axis, finite.
     region : ((d,), (d,)), m
-        Box of reference positions that limits the faces.
+        Box of reference positions; water acts on the parts of faces inside it.
     unit_weight
-        Unit weight of the water, N/m^3, > 0; by default that of the scene's fluid.  A warning reports a difference from
-        fluid density times gravity.
+        Unit weight of the water, N/m^3, > 0; by default that of the scene's fluid.  If it differs from fluid density
+        times gravity, a warning is given.
 
     Raises
     ------
     ValueError
-        A value out of range; for functions, in the step that needs the value.
+        A value out of range.  An invalid value of a function raises the error in the step that needs the value.
     """
     if unit_weight is not None:
         numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
@@ -57,7 +57,7 @@ def water(
 
 @dataclass(frozen=True)
 class WaterPressure(OfWater):
-    """Pressure of free water as a function of time and position."""
+    """Hydrostatic pressure of free water, as a function of time and position."""
 
     side: str
     level: float | Callable[[float], float]

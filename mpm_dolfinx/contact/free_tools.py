@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Free tools: rigid tools with mass, moved by weight, loads and contact forces.
+"""Free tools: rigid tools with a mass, which weight, loads and contact forces move.
 
-The motion q of a tool in a step, its displacement and in 2D its rotation, follows, as for nodes
+Let q be the motion of a tool in a step: its displacement and, in 2D, its rotation.  As for nodes
 (`mechanics/inertia.py`), m (q - q^) / (own dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, q^ is the
-free flight, l the load, and f are the contact forces on the points.  A q moves the places of the points with the
-tool: it has the columns e_x, e_y, and e_z x r, with the lever arm r.  q is condensed.  Let D be minus the derivative
-of f by the displacement of the points, and dw their increment.  Forces rotate with the tool, so f changes by (D A +
-E) dq, and the force on the tool by
+motion without forces in the step, l is the load, and f are the contact forces on the points.  A q is the displacement
+of the contact positions on the tool.  The columns of A are e_x, e_y, and e_z x r with the lever arm r.
 
-    A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f,
+The unknowns q are condensed.  Let D be minus the derivative of f by the displacement of the points, and dw their
+increment.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns 0, 0, e_z x f.  The force
+on the tool changes by the product of dq with
 
-where E has the columns 0, 0, e_z x f.  With S, the sum of this matrix and m / (own dt)^2, Newton's method gives
+    A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
-    dq = S^-1 (l - sum A^T f - m (q - q^) / (own dt)^2 + sum (A^T D + E^T) dw),
+With S, the sum of this matrix and m / (own dt)^2, Newton's method gives
 
-so forces on the points are f + (D A + E) S^-1 (...), and minus their derivative is D - (D A + E) S^-1 (A^T D + E^T).
+    dq = S^-1 (l - sum A^T f - m (q - q^) / (own dt)^2 + sum (A^T D + E^T) dw).
+
+Forces on the points are therefore f + (D A + E) S^-1 (...); minus their derivative is
+D - (D A + E) S^-1 (A^T D + E^T).
 """
 
 from __future__ import annotations
@@ -26,48 +29,42 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 from mpm_dolfinx.conditions.acting import At, Shares
-from mpm_dolfinx.contact.problem import ContactProblem, Found, Gone, outer
+from mpm_dolfinx.contact.problem import ContactProblem, Found, SubstepMotion, outer
 from mpm_dolfinx.mechanics.inertia import Flight
 
 
-class Goes(NamedTuple):
-    """Linearised motion of free tools at w (m, d), m: motion travel + shift (k, q), plus inverse (k, q, q) of S times
-    further forces.
+class FreeMotion(NamedTuple):
+    """Linearised motion of free tools for contact pairs at relative displacements w, see the module."""
 
-    found: contact at w.
-    """
-
-    w: NDArray[np.float64]
-    travel: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    found: Found
+    w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
+    motion: NDArray[np.float64]  # motion of the tools at w (k, q), m and rad
+    shift: NDArray[np.float64]  # Newton increment of this motion (k, q), m and rad
+    inverse: NDArray[np.float64]  # S^-1 (k, q, q); its product with further forces is added to the motion
+    found: Found  # contact at w
 
 
-class Met(NamedTuple):
-    """Equation of motion of free tools: inverse (k, q, q) of S; off (k,): relative out-of-balance force; shift (k, q):
-    Newton increment, m, rad.
-    """
+class MotionEquation(NamedTuple):
+    """Linearised equation of motion of free tools."""
 
-    inverse: NDArray[np.float64]
-    off: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    inverse: NDArray[np.float64]  # S^-1 (k, q, q)
+    off: NDArray[np.float64]  # relative out-of-balance force (k,)
+    shift: NDArray[np.float64]  # Newton increment (k, q), m and rad
 
 
 class FreeTools(ContactProblem):
-    """Mixin of `ToolLoads` for scenes with free tools.
+    """Base class that adds the motion of free tools to `ToolLoads`.
 
     Parameters
     ----------
     placed
         Arguments of `ToolLoads`.
     mass, guides
-        Masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free; projections (k, q, q) on
-        their motions, see `ways_of`.
+        Masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  Projections (k, q, q) on
+        the motions that each tool can perform, see `motion_count`.
     velocity, pushes
-        Velocities (k, q), m/s and rad/s, at the start of the step; loads (k, q), N and N m.
+        Velocities (k, q), m/s and rad/s, at the start of the step.  Loads (k, q), N and N m.
     """
 
     couples = True
@@ -78,23 +75,23 @@ class FreeTools(ContactProblem):
         self._free_tools = mass[:, 0] > 0
         self._pushes = pushes
         self.flight = Flight(velocity, velocity)
-        """Velocities and accelerations of the tools (k, q), m/s and m/s^2, at the start of the substep."""
+        """Velocities and accelerations (k, q) of the tools at the start of the substep, m/s, m/s^2, rad/s, rad/s^2."""
         self._rate, self._free = 0.0, np.zeros_like(velocity)
 
-    def begun(self, shares: Shares, gone: Gone | None) -> FreeTools:
+    def begun(self, shares: Shares, earlier: SubstepMotion | None) -> FreeTools:
         """See `Loads`."""
-        out = super().begun(shares, gone)
-        if gone is not None:
-            out.flight = gone.flight
+        out = super().begun(shares, earlier)
+        if earlier is not None:
+            out.flight = earlier.flight
         if shares.gravity is not None:
             pulls = np.zeros_like(self._pushes)
             pulls[:, : self.grid.dim] = shares.gravity
             out._pushes = self._pushes + np.einsum("kij,kj->ki", self._guides, self._mass * pulls)
         out._rate, out._free = shares.own**-2, out.flight.free(shares.own, shares.before)
-        out.now = self.now._replace(ways=out._goes(np.zeros_like(self.pairs.x), out._free))
+        out.now = self.now._replace(linear=out._free_motion(np.zeros_like(self.pairs.x), out._free))
         return out
 
-    def flown(self, at: At) -> Gone:
+    def flown(self, at: At) -> SubstepMotion:
         """See `Loads`."""
         return super().flown(at)._replace(flight=self._after(at))
 
@@ -104,7 +101,7 @@ class FreeTools(ContactProblem):
         return np.where(free, self._moved(self.found(at), self._after(at).velocity), super().tool_velocity(at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`: contact forces change the energy of a free tool, and loads do work on it."""
+        """See `Loads`.  Contact forces change the energy of free tools, and loads do work on them."""
         rubs, more = super().rubbing(at, v)
         free = self._free_tools[self.pairs.number]
         more -= float((self.found(at).touch.force * self.tool_velocity(at))[free].sum())
@@ -112,77 +109,91 @@ class FreeTools(ContactProblem):
         return rubs, more + pushed * (self.grid.comm.rank == 0)
 
     def _after(self, at: At) -> Flight:
-        """Return the velocities after the substep."""
-        acceleration = self._rate * (self.found(at).travel - self._free)
+        """Return velocities and accelerations of the tools after the substep."""
+        acceleration = self._rate * (self.found(at).motion - self._free)
         return self.flight.after(acceleration, self.shares.own, self.shares.before)
 
     def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._travel(w))
+        return self._find_at(w, self._motion(w))
 
-    def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
-        found = super()._find_at(w, way)
-        if way.ndim == 1:  # before the first substep
+    def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
+        found = super()._find_at(w, motion)
+        if motion.ndim == 1:  # before the first substep
             return found
-        return found._replace(balanced=found.touch.force + self._pulled(found, self._met(found).shift))
+        return found._replace(balanced=found.touch.force + self._pulled(found, self._equation(found).shift))
 
     def _moved(self, found: Found, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return A q (m, d): motion at the points by motions (k, q) of the tools."""
+        """Return A q (m, d), the displacements of contact positions caused by motions q (k, q) of the tools."""
         d, of = self.grid.dim, q[self.pairs.number]
         return of[:, :d] + of[:, d:] * across(found.at.arm) if d == 2 else of
 
     def _pulled(self, found: Found, q: NDArray[np.float64], adjoint: bool = False) -> NDArray[np.float64]:
-        """Return (D A + E) q (m, d), N, of motions (k, q) of the tools, or with the adjoint of D."""
+        """Return (D A + E) q (m, d), N, for motions q (k, q) of the tools.  `adjoint` replaces D by its adjoint."""
         out = self.now.law.slope(found.touch, found.at, self._moved(found, q), adjoint)
         d = self.grid.dim
         return out + q[self.pairs.number, d:] * across(found.touch.force) if d == 2 else out
 
     def _onto(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return A^T f (m, q) of forces (m, d), N, at the points."""
+        """Return the generalised forces A^T f (m, q) on the tools, from the contact forces f (m, d), N."""
         moment = (across(found.at.arm) * force).sum(axis=1, keepdims=True)[:, : self.grid.dim == 2]
         return np.hstack([force, moment])
 
-    def _travel(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions (k, q) of tools at w (m, d), m, along the last Newton step."""
-        goes = self.now.ways
+    def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return bounds (m, q) of the generalised forces on the tools, from the sizes (m, d) of contact forces, N.
+
+        A moment is compared with lever arm times force: the moment of a smooth disc consists of rounding errors alone.
+        """
+        moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
+        return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
+
+    def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the motions (k, q) of the tools at w (m, d), m, from the last linearisation."""
+        last = self.now.linear
         law = self.now.law
-        dw = w - goes.w
-        moved = self._onto(goes.found, law.slope(goes.found.touch, goes.found.at, dw))
+        dw = w - last.w
+        moved = self._onto(last.found, law.slope(last.found.touch, last.found.at, dw))
         d = self.grid.dim
-        moved[:, d:] += (across(goes.found.touch.force) * dw).sum(axis=1, keepdims=True)[:, : d == 2]
+        moved[:, d:] += (across(last.found.touch.force) * dw).sum(axis=1, keepdims=True)[:, : d == 2]
         on = law.by_contact(np.column_stack([(dw != 0).any(axis=1), moved]))
         if not on[:, 0].any():
-            return goes.travel
-        return goes.travel + goes.shift + np.einsum("kij,kj->ki", goes.inverse, on[:, 1:])
+            return last.motion
+        return last.motion + last.shift + np.einsum("kij,kj->ki", last.inverse, on[:, 1:])
 
-    def _goes(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Goes:
-        """Return the linearised motion of tools after motions (k, q), for bodies at w (m, d), m."""
-        found = self._find_at(w, travel)
-        met = self._met(found)
-        return Goes(w, travel, met.shift, met.inverse, found)
+    def _free_motion(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> FreeMotion:
+        """Return the linearised motion of the tools about the motions `motion` (k, q), for pairs at w (m, d), m."""
+        found = self._find_at(w, motion)
+        equation = self._equation(found)
+        return FreeMotion(w, motion, equation.shift, equation.inverse, found)
 
-    def _met(self, found: Found) -> Met:
-        """Return the equation of motion of the tools at a contact."""
+    def _equation(self, found: Found) -> MotionEquation:
+        """Return the linearised equation of motion of the tools, for a contact."""
         law = self.now.law
         d = self.grid.dim
         motions = self._guides.transpose(2, 0, 1)
         columns = [self._onto(found, self._pulled(found, q)) for q in motions]
-        onto = self._onto(found, found.touch.force)
-        rows = np.stack([onto, np.abs(onto), *columns], axis=2)  # of no contact on some processes
+        force = found.touch.force
+        onto = self._onto(found, force)
+        unknown = (law.rounding(self.now.state) * (found.touch.stiff > 0))[:, None]
+        size, least = self._sizes(found, np.abs(force)), self._sizes(found, np.broadcast_to(unknown, force.shape))
+        rows = np.stack([onto, size, least, *columns], axis=2)  # empty on processes without contact
         sums = law.by_contact(rows.reshape(len(onto), int(np.prod(rows.shape[1:]))))
-        sums = sums.reshape(len(motions[0]), len(motions), 2 + len(columns))
-        S = sums[:, :, 2:]
+        sums = sums.reshape(len(motions[0]), len(motions), 3 + len(columns))
+        S = sums[:, :, 3:]
         if d == 2:  # the lever arm changes as the tool moves
             S[:, d, :d] += np.einsum("kij,ki->kj", self._guides[:, :d, :d], across(sums[:, :d, 0]))
-        back = self._rate * self._mass * (found.travel - self._free)
-        S = self._guides @ S + (self._rate * self._mass)[:, None] * np.eye(len(motions))
+        resists = self._rate * self._mass
+        inertial = resists * (found.motion - self._free)
+        S = self._guides @ S + resists[:, None] * np.eye(len(motions))
         free = self._free_tools
         inverse = np.zeros_like(S)
         inverse[free] = self._guides[free] @ np.linalg.inv(S[free])
-        off = self._pushes - back - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
-        scale = np.maximum(np.abs([self._pushes, back]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
+        off = self._pushes - inertial - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
+        scale = np.maximum(np.abs([self._pushes, inertial]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
         scale[:, :d] = np.linalg.norm(scale[:, :d], axis=1, keepdims=True)
+        rounding = sums[:, :, 2] + ROUND_OFF * resists * (np.abs(found.motion) + np.abs(self._free))
+        scale = np.maximum(scale, rounding / SAME)
         share = (np.abs(off) / np.where(scale > 0, scale, 1.0)).max(axis=1)
-        return Met(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
+        return MotionEquation(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 
     def pattern(self, unknowns) -> PETSc.Mat | None:
         """See `Loads`: all nodes under a free tool are coupled."""
@@ -198,7 +209,7 @@ class FreeTools(ContactProblem):
         """See `Loads`."""
         K = super().coupling(at)
         found = self.found(at)
-        inverse = self._met(found).inverse
+        inverse = self._equation(found).inverse
         for k in np.flatnonzero(self._free_tools):
             on = (np.arange(len(inverse)) == k)[:, None]
             for e, to in zip(np.eye(inverse.shape[1]), inverse[k].T, strict=True):
@@ -210,40 +221,41 @@ class FreeTools(ContactProblem):
 
     def settle(self, at: At, sticks: bool) -> bool:
         """See `Loads`."""
-        w, travel = self._apart_by(self.now.law, at), self.found(at).travel
+        w, motion = self._apart_by(self.now.law, at), self.found(at).motion
         changed = super().settle(at, sticks)
-        self.now = self.now._replace(ways=self._goes(w, travel))
+        self.now = self.now._replace(linear=self._free_motion(w, motion))
         return changed
 
     def augment(self, at: At) -> bool:
-        """See `Loads`: tools must be in equilibrium too."""
+        """See `Loads`.  The tools must be in equilibrium too."""
         if super().augment(at):
             return True
         found = self.found(at)
-        met = self._met(found)
-        if not (met.off > SAME).any():
+        equation = self._equation(found)
+        if not (equation.off > SAME).any():
             return False
-        self.now = self.now._replace(ways=self._goes(self._apart_by(self.now.law, at), found.travel + met.shift))
+        w = self._apart_by(self.now.law, at)
+        self.now = self.now._replace(linear=self._free_motion(w, found.motion + equation.shift))
         return True
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`: with velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
+        """See `Loads`.  Adds velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
         out = super().outcome(at)
         d, names = self.grid.dim, self.now.law.names
-        way, velocity = self.pushes.start + self.found(at).travel, self._after(at).velocity
-        turns = self._guides[:, -1, -1]
+        motion, velocity = self.pushes.start + self.found(at).motion, self._after(at).velocity
+        rotating = self._guides[:, -1, -1]
         out["tool_travel"] = {
-            name: way[k, :d] if self._free_tools[k] else np.array(0.0) for k, name in enumerate(names)
+            name: motion[k, :d] if self._free_tools[k] else np.array(0.0) for k, name in enumerate(names)
         }
         out["tool_velocity"] = {names[k]: velocity[k, :d] for k in np.flatnonzero(self._free_tools)}
-        if d == 2 and turns.any():
+        if d == 2 and rotating.any():
             out |= {
-                quantity: {names[k]: np.array(of[k, d]) for k in np.flatnonzero(turns)}
-                for quantity, of in (("tool_rotation", way), ("tool_spin", velocity))
+                quantity: {names[k]: np.array(of[k, d]) for k in np.flatnonzero(rotating)}
+                for quantity, of in (("tool_rotation", motion), ("tool_spin", velocity))
             }
         return out
 
 
 def across(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return e_z x v of vectors v (m, 2)."""
+    """Return e_z x v (m, 2) for vectors v (m, 2)."""
     return np.stack([-v[:, 1], v[:, 0]], axis=1)

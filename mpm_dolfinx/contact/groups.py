@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Groups of bodies that touch without sticking: each group has its own copy of the grid."""
+"""Groups of bodies that touch other groups without sticking: each group has a separate copy of the grid."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mpm_dolfinx.grid.grid import Grid, GridOfGroups
 class Contact:
     """Two groups of bodies in contact, with slip and separation.
 
-    Bodies of one group stick where they touch.  Groups do not penetrate each other, and may separate.  No fluid passes
-    between them.  In a scene with contacts each body belongs to a group, and each two groups have one contact.  The
-    simulation's `tool_forces` are forces on the bodies of `one`.
+    Bodies of the same group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
+    No fluid passes between them.  In a scene with contacts, each body must belong to a group, and each pair of groups
+    must have one contact.  `tool_forces` of the simulation are the forces on the bodies of `one`.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Contact:
     Raises
     ------
     ValueError
-        An invalid value.  From the scene: groups with common bodies, or without a contact.
+        An invalid value.  From the scene: groups with common bodies, or a pair of groups without a contact.
     """
 
     one: int | Sequence[int]
@@ -57,7 +57,7 @@ class Contact:
         return self.friction > 0 or self.adhesion > 0
 
     def groups(self, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the two groups, for a scene of `count` bodies."""
+        """Return the indices of the bodies of both groups, in a scene of `count` bodies."""
         allowed = f"indices of the bodies, 0 to {count - 1}"
         found = []
         for name in ("one", "other"):
@@ -78,42 +78,42 @@ class Contact:
 
 
 def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
-    """Return the groups of a scene of `count` bodies, sorted by their first bodies; ValueError for invalid groups."""
+    """Return the groups in a scene of `count` bodies, sorted by first body; raise ValueError for invalid groups."""
     pairs = [contact.groups(count) for contact in contacts]
     groups = sorted({group for pair in pairs for group in pair})
     for one, other in combinations(groups, 2):
         if common := set(one) & set(other):
             what = f"contacts: body {min(common)} is in the groups {line(one)} and {line(other)}"
             raise ValueError(f"{what}, must be in one; name all bodies of a group in each of its contacts")
-        met = sum({*pair} == {one, other} for pair in pairs)
-        if met != 1:
-            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {met}, must have one contact")
+        between = sum({*pair} == {one, other} for pair in pairs)
+        if between != 1:
+            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {between}, must have one contact")
     if missing := set(range(count)) - {body for group in groups for body in group}:
         raise ValueError(f"contacts: body {min(missing)} is in no group, must be in one")
     return groups
 
 
 def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
-    """Return the conditions that are contacts."""
+    """Return the contacts among the conditions."""
     return [one for one in conditions if isinstance(one, Contact)]
 
 
 def grouped(
     grid: Grid, bodies: Sequence[Body], conditions: Sequence[Any], quadrature: str, other: dict[str, Any]
 ) -> Grid:
-    """Return the grid of a scene; with contacts, a grid with a copy for each group.
+    """Return the grid of a scene; in a scene with contacts, a grid with a copy for each group.
 
     Parameters
     ----------
     conditions, quadrature
         See `Simulation`.
     other
-        Parts that a scene with contacts must not have, by name.
+        Options that a scene with contacts must not use, by name.
 
     Raises
     ------
     ValueError
-        Invalid contacts, or contacts that other parts of the scene exclude.
+        Invalid contacts, or options that contacts exclude.
     """
     contacts = contacts_of(conditions)
     if not contacts:

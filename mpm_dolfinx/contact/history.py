@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Contact history of material points: pressures and shear tractions from step to step."""
+"""Contact history of material points: pressures and shear tractions that one step passes to the next."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Rough(Protocol):
-    """Strength of a tool or contact: mu, adhesion, Pa, and whether it resists slip."""
+    """Shear strength of a tool or contact: coefficient mu, adhesion, Pa, and whether the contact resists slip."""
 
     friction: float
     adhesion: float
@@ -33,48 +33,21 @@ def shear_name(name: str) -> str:
     return f"{name}_shear"
 
 
-def kept(contacts: Mapping[str, Rough], n: int, dim: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Return zero histories of n points for each contact: pressures (n,) and, if it resists slip, tractions (n, d)."""
-    return {
-        name: {pressure_name(name): np.zeros(n), **({shear_name(name): np.zeros((n, dim))} if contact.grips else {})}
-        for name, contact in contacts.items()
-    }
-
-
-def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
-    """Return points without the fields of these names."""
-    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
-
-
-def gripped(
-    points: MaterialPoints, new: Mapping[str, NDArray[np.float64]], before: MaterialPoints | None
-) -> MaterialPoints:
-    """Return points with new fields, where points present `before` keep their values."""
-    if before is not None:
-        here, at = before.find(points.id)
-        for name in new.keys() & before.data.keys():
-            new[name][here] = before.data[name][at]
-    return replace(points, data={**points.data, **new}) if new else points
-
-
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Origin of contact pairs: their exchange to the owners of cells, and data (n,) before this exchange.
+    """Material points to which contact pairs belong; arrays (n,) before pairs are sent to the owners of cells."""
 
-    point (n,): index of the material point on this process; number (n,): contact; area (n,): m^(d-1).
-    """
-
-    travel: Exchange
-    point: NDArray[np.int64]
-    number: NDArray[np.int64]
-    area: NDArray[np.float64]
+    exchange: Exchange  # sends the pairs to the owners of their cells
+    point: NDArray[np.int64]  # index of the material point on this process (n,)
+    number: NDArray[np.int64]  # number of the contact (n,)
+    area: NDArray[np.float64]  # contact area (n,), m^(d-1)
 
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with mean pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
-        push = self.travel.back(push)
-        shear = self.travel.back(shear)
+        """Return the points with means of pressures `push` (m,) and tractions `shear` (m, d), Pa, of their pairs."""
+        push = self.exchange.back(push)
+        shear = self.exchange.back(shear)
         data = dict(points.data)
         n = len(points)
         for number, (name, contact) in enumerate(contacts.items()):

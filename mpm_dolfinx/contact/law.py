@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Contact law: pressure, Coulomb friction and adhesion, with one condition for each contact and cell.
 
-The contact pressure at a place with gap g, and its energy per area, are
+At a position with gap g, the contact pressure and its energy per area are
 
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
 The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier lambda has one value for each
-contact and cell.  It starts from the pressure of the previous step, and is augmented (Uzawa) until the mean penetration
-of each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step, and on the traction t_n of
-the points after the previous step,
+contact and cell, which starts from the pressure of the previous step.  Augmentation (Uzawa's method) updates lambda
+until the mean penetration in each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step,
+and on the shear traction t_n of the points after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
 with the projection P on the tangent plane.  Sticking contact is elastic with stiffness k_t.
 
-The slipping set is updated after Newton steps (active set).  Updates in each residual would make cells chatter, because
-slip has no stiffness.  All cells start in stick, at any traction.  A cell with reversed slip returns to stick, and may
-then slip again, only near equilibrium.  A sticking cell that opens slips afterwards, the second time for good.  Under a
-round tool at first contact the mean normal is inclined, and shear alone would open and close the contact.
+The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
+cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
+traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
+that opens slips afterwards, and does so for good the second time.  Otherwise shear alone could open and close the
+contact under a round tool at first contact, where the mean normal is inclined.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
@@ -40,68 +41,55 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""k in units of (resistance) / (cell size)."""
+"""Stiffness k in units of (resistance) / (cell size)."""
 GRIP = 6.0
-"""k_t in units of (resistance) / (cell size): stiffer shears alternate from cell to cell without moving nodes."""
+"""Stiffness k_t in units of (resistance) / (cell size).  A larger k_t allows shears that cancel at the nodes."""
 DEPTH = 5e-4  # cells: allowed mean penetration
-TOUCH = 1e-13  # of the grid: gap of contact within rounding; light bodies penetrate less than 1e-8 cells
-SLIVER = 0.25  # of a cell's face: smaller contact areas count with less penetration
+SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 SLOW, STIFFER = 0.6, 10.0
-"""k is multiplied by STIFFER if an augmentation leaves more than the share SLOW of the penetration."""
+"""k is multiplied by STIFFER if an augmentation leaves more than the fraction SLOW of the penetration."""
 RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State of the iterations for k conditions, except for displacements.
+    """State of the contact iterations, without displacements.  Each contact has one condition per cell, k in all."""
 
-    pressure (k,): lambda, Pa; slip (k, d): direction of slip, zero in stick; resticks (k,): whether slip returned to
-    stick; parts (k,): and opened again afterwards; stuck (k, d): traction in stick at the last update, Pa; raised:
-    factor of k; off: penetration after the last augmentation, cells; rounds: number of augmentations; follows: number
-    of pair updates.
-    """
-
-    pressure: NDArray[np.float64]
-    slip: NDArray[np.float64]
-    resticks: NDArray[np.bool_]
-    parts: NDArray[np.bool_]
-    stuck: NDArray[np.float64]
-    raised: float = 1.0
-    off: float = np.inf
-    rounds: int = 0
-    follows: int = 0
+    pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
+    slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
+    resticks: NDArray[np.bool_]  # whether the condition has returned from slip to stick (k,)
+    parts: NDArray[np.bool_]  # whether it has opened after that (k,)
+    stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
+    raised: float = 1.0  # factor on the stiffness k
+    off: float = np.inf  # penetration after the last augmentation, cells
+    rounds: int = 0  # number of augmentations
+    follows: int = 0  # number of updates of the pairs
 
     @property
     def slips(self) -> NDArray[np.bool_]:
-        """Which conditions (k,) slip."""
+        """Which conditions slip (k,)."""
         return self.slip.any(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Contact of m pairs and k conditions at some displacement.
+    """Forces and their derivatives for m contact pairs and k conditions at given displacements."""
 
-    force (m, d): force on the points, N; push (m,): pressure, Pa; stiff (m,): -d push / d gap, Pa/m; pressure (k,):
-    mean pressure, Pa; sticks (k,): whether in contact and stick; trial, shear (k, d): traction in stick, and actual
-    traction, Pa; most (k,): shear strength, Pa; grip (k, d, d): -d traction / d slip, Pa/m; rise (k, d): d traction / d
-    pressure.
-    """
-
-    force: NDArray[np.float64]
-    push: NDArray[np.float64]
-    stiff: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    sticks: NDArray[np.bool_]
-    trial: NDArray[np.float64]
-    shear: NDArray[np.float64]
-    most: NDArray[np.float64]
-    grip: NDArray[np.float64]
-    rise: NDArray[np.float64]
+    force: NDArray[np.float64]  # force on the points (m, d), N
+    push: NDArray[np.float64]  # pressure (m,), Pa
+    stiff: NDArray[np.float64]  # minus the derivative of the pressure by the gap (m,), Pa/m
+    pressure: NDArray[np.float64]  # mean pressure (k,), Pa
+    sticks: NDArray[np.bool_]  # whether the condition is in contact and sticks (k,)
+    trial: NDArray[np.float64]  # shear traction in stick (k, d), Pa
+    shear: NDArray[np.float64]  # shear traction (k, d), Pa
+    most: NDArray[np.float64]  # shear strength (k,), Pa
+    grip: NDArray[np.float64]  # minus the derivative of the shear traction by slip (k, d, d), Pa/m
+    by_pressure: NDArray[np.float64]  # derivative of the shear traction by the pressure (k, d)
 
 
 class ContactLaw:
-    """The contact conditions of a substep.
+    """Contact pressures, shear tractions and their derivatives in a substep.
 
     Parameters
     ----------
@@ -118,7 +106,7 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Contact and cell of the conditions (k,), in one number."""
+        """Contact and cell of each condition (k,), combined in one number."""
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
         self.strength = strength[key // self.grid.num_local]
@@ -128,32 +116,34 @@ class ContactLaw:
         self.grips = any(contact.grips for contact in contacts)
 
     def begins(self) -> ContactState:
-        """Return the initial state: pressures of the previous step, all in stick."""
+        """Return the initial state: pressures of the previous step, and stick everywhere."""
         k, d = len(self.key), self.grid.dim
         none = np.zeros(k, dtype=bool)
         return ContactState(self.mean(self.pairs.pressure), np.zeros((k, d)), none, none, np.zeros((k, d)))
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (k, ...) of values (m, ...) in the conditions."""
+        """Return the sums (k, ...) of values (m, ...) of the pairs of each condition."""
         size = len(self.area)
         columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
         out = np.stack([sum_by(self.of, column, size) for column in columns], axis=1)
         return out.reshape(size, *values.shape[1:])
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the area-weighted means (k, ...) of values (m, ...) in the conditions."""
+        """Return the area-weighted means (k, ...) of values (m, ...) of the pairs of each condition."""
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
-        """Return k (m,), Pa/m."""
+        """Return the stiffness k (m,), Pa/m, of the pairs."""
         return state.raised * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
-        """Return the contact of the pairs at a geometry."""
+        """Return forces and derivatives for pairs with a geometry `at`."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
+        # only rounding: light bodies penetrate less than 1e-8 cells
+        rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
+        touches = (push > 0) | (at.gap <= rounding)
         pressure = self.mean(push)
         on = np.zeros(len(self.area), dtype=bool)
         normal = self.mean(at.n)
@@ -167,9 +157,9 @@ class ContactLaw:
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
     ) -> tuple:
-        """Return the fields of `Touch` from `sticks` on.
+        """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        n, slip, old (k, d): means of normals, of slips, m, and of tractions before the step, Pa.
+        Means of the conditions (k, d): normals n, slips, m, and tractions before the step `old`, Pa.
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -177,16 +167,16 @@ class ContactLaw:
         trial = np.einsum("kij,kj->ki", P, old * on[:, None] - hold[:, None] * slip)
         size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
-        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until an update
+        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until updated
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
-        turns = hold * np.where(slips, onward * most / size, 1.0)
-        grip = turns[:, None, None] * (P - along[:, :, None] * along[:, None, :])
-        rise = (mu + RAMP * ramp)[:, None] * along
+        scale = hold * np.where(slips, onward * most / size, 1.0)
+        grip = scale[:, None, None] * (P - along[:, :, None] * along[:, None, :])
+        by_pressure = (mu + RAMP * ramp)[:, None] * along
         shear = np.where(slips[:, None], most[:, None] * along, trial)
-        return ~slips & on, trial, shear, most, grip, rise
+        return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return minus the derivative D (m d, m d) of the forces by w, without the rotation of shears."""
+        """Return D (m d, m d): minus the derivative of the forces by w, without the rotation of shear tractions."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -197,20 +187,20 @@ class ContactLaw:
         D = scipy.sparse.bsr_matrix((own, np.arange(m), np.arange(m + 1)), shape=(m * d, m * d)).tocsr()
         if not self.grips:
             return D
-        # means over conditions, of displacements and of pressures
+        # means of displacements and pressures over the pairs of each condition
         share = pairs.area / self.area[self.of]
         mean = scipy.sparse.csr_matrix((share, (self.of, np.arange(m))), shape=(len(self.area), m))
         wide = scipy.sparse.kron(mean, scipy.sparse.identity(d), format="csr")
         k, whole = len(self.area), self.area[:, None, None]
         blocks = (np.arange(k), np.arange(k + 1))
         grip = scipy.sparse.bsr_matrix((whole * touch.grip, *blocks), shape=(k * d, k * d))
-        rise = scipy.sparse.bsr_matrix((whole * touch.rise[:, :, None], *blocks), shape=(k * d, k))
+        by_pressure = scipy.sparse.bsr_matrix((whole * touch.by_pressure[:, :, None], *blocks), shape=(k * d, k))
         pressed = (touch.stiff[:, None] * at.n)[:, None]
         slope = scipy.sparse.bsr_matrix((pressed, np.arange(m), np.arange(m + 1)), shape=(m, m * d))
-        return (D + wide.T @ (grip @ wide + rise @ (mean @ slope))).tocsr()
+        return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return D v (m, d), or its adjoint, for v (m, d): see `tangent`."""
+        """Return D v (m, d) for v (m, d), or with `adjoint` the product with the transpose, see `tangent`."""
         area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:
@@ -218,14 +208,14 @@ class ContactLaw:
         if self.grips:
             mean = self.mean(v)
             if adjoint:
-                out = out + touch.stiff[:, None] * at.n * (touch.rise * mean).sum(axis=1)[self.of, None]
+                out = out + touch.stiff[:, None] * at.n * (touch.by_pressure * mean).sum(axis=1)[self.of, None]
             else:
-                out = out + (touch.rise * self.mean(across))[self.of]
+                out = out + (touch.by_pressure * self.mean(across))[self.of]
             out = out + np.einsum("kji,kj->ki" if adjoint else "kij,kj->ki", touch.grip, mean)[self.of]
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update the slipping set and, if sticks, returns to stick; return the state and whether the set changed."""
+        """Update which conditions slip; return the state and whether any changed.  `sticks`: allow returns to stick."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -242,11 +232,11 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, x: NDArray[np.float64]) -> ContactState:
-        """Return the state with the present pressures as lambda; unchanged if mean penetrations are small enough.
+        """Return the state with lambda set to the pressures; unchanged if mean penetrations are small enough.
 
-        x (m, d): positions of the points, m.  Raises NotConverged after ROUNDS augmentations.
+        `x` (m, d), m, are the positions of the points.  Raise NotConverged after ROUNDS augmentations.
         """
-        # slivers of cells cannot correct their penetration alone, and follow their neighbours
+        # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
         plane = self.total(self.pairs.area / self.grid.around(x))
         whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.key % self.grid.num_local)))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
@@ -259,7 +249,7 @@ class ContactLaw:
             where = [f"{line(self.contacts[number[k]])}: at {x[self.of == k][0] + self.grid.base}" for k in worst]
             message = f"{''.join(where)} penetrates by {most:.2g} cells: does a wall fix the body there?"
             raise NotConverged(first(self.grid.comm, message if where else ""))
-        # fluid, or a nearly incompressible body, is stiffer than k
+        # the pore fluid, or a nearly incompressible body, is stiffer than k
         raised = state.raised * (STIFFER if most > SLOW * state.off else 1.0)
         return replace(state, pressure=touch.pressure, raised=raised, off=most, rounds=state.rounds + 1)
 
@@ -269,19 +259,20 @@ class ContactLaw:
 
     @property
     def rounding_of_gap(self) -> NDArray[np.float64] | float:
-        """Rounding error of gaps, m; for each pair (m,), or for all."""
-        return 4 * EPSILON * self.pairs.reach
+        """Rounding error of gaps, m: (m,) for each pair, or one value for all."""
+        return 4 * EPSILON * self.pairs.largest_coordinate
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (contacts, ...) of values (m, ...) over each contact; collective."""
+        """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""
         columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
         sums = np.stack([sum_by(self.pairs.number, column, len(self.contacts)) for column in columns], axis=1)
         return over_all(self.grid.comm, sums).reshape(len(self.contacts), *values.shape[1:])
 
     def forces(self, touch: Touch, at: Geometry) -> NDArray[np.float64]:
-        """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m; collective.
+        """Return the forces and moments of each contact on the bodies, on all processes, N and N m.
 
-        In axisymmetry moments are zero, and the radial force is the sum of outward forces.
+        Shape (contacts, 3) in 2D, (contacts, 6) in 3D.  In axisymmetry moments are zero, and the radial force is the
+        integral of the outward traction.
         """
         force, arm = self.pairs.sign[self.pairs.number, None] * touch.force, at.arm * (not self.grid.axisymmetric)
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
@@ -290,7 +281,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        Pairs in stick keep their deviation from the mean of the cell, because repeated averaging would cause creep.
+        In stick, pairs keep their deviation from the mean of the cell, because repeated averaging would cause creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

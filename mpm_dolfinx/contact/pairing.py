@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Contacts of groups in a stage: opposite places on their surfaces, and the contact history of points.
+"""Contacts between groups in a stage: pairs of opposite positions on their surfaces.
 
-The contact equations are in `problem`.
+`problem` has the contact equations.
 """
 
 from __future__ import annotations
@@ -24,112 +24,94 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
+from mpm_dolfinx.conditions.acting import Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import resistance
-from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import FacePairs
+from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 REACH = 2.0
-"""Largest gap, in cells, that may close in a step; steps with larger motion are rejected."""
+"""Largest gap, in cells, that may close in a step.  Steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Gap, in cells, above which faces do not touch before the next update of the pairs."""
+"""Gap, in cells, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration, in cells, above which a position is behind a thin body."""
+"""Penetration, in cells, above which a position lies behind a thin body and is not paired."""
 CANDIDATES = {2: 8, 3: 24}
-"""Number of nearest points on the other surface whose faces are tried."""
+"""Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""Distance, in cells, from points on the other surface within which corners follow the Q1 field."""
+"""Distance from points on the other surface, in cells, within which corners follow the Q1 field."""
 PLACES = 1 << 32
-"""Upper bound of a process's quadrature points on a surface."""
+"""Number that exceeds the quadrature points of any process on a surface."""
 
 
 class Facets(NamedTuple):
-    """Quadrature points on the faces of the other group, from all processes; arrays over n points.
+    """Quadrature points of all processes on the faces of one group; arrays over n points."""
 
-    x (n, d): m; face (n,): row of the `Surface`; cell (n,): lexicographic number; resistance (n,): Pa; corners, cut
-    (n, 2^(d-1), d): corners of the face at present and at the last grid reset, m; outward (n, d): unit normal.
-    """
-
-    x: NDArray[np.float64]
-    face: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    resistance: NDArray[np.float64]
-    corners: NDArray[np.float64]
-    cut: NDArray[np.float64]
-    outward: NDArray[np.float64]
+    x: NDArray[np.float64]  # position (n, d), m
+    face: NDArray[np.int64]  # row of the face in its `Surface` (n,)
+    cell: NDArray[np.int64]  # lexicographic cell (n,)
+    resistance: NDArray[np.float64]  # reference modulus (n,), Pa
+    corners: NDArray[np.float64]  # current corners of the face (n, 2^(d-1), d), m
+    cut: NDArray[np.float64]  # corners of the face at the last grid reset (n, 2^(d-1), d), m
+    outward: NDArray[np.float64]  # outward unit normal (n, d)
 
 
 class Pairs(NamedTuple):
-    """Points of one surface, and opposite places on the other; arrays over m pairs.
+    """Points of one surface, and opposite positions on the other surface; arrays over m pairs."""
 
-    row (m,): point among the patches of this process; facet (m,): one of the `Facets` on the opposite face; t (m, 2):
-    coordinates on this face; gap (m,): distance along the point's normal, m.
-    """
-
-    row: NDArray[np.int64]
-    facet: NDArray[np.int64]
-    t: NDArray[np.float64]
-    gap: NDArray[np.float64]
+    row: NDArray[np.int64]  # index of the point among the quadrature points of this process (m,)
+    facet: NDArray[np.int64]  # index in `Facets` of a point on the opposite face (m,)
+    t: NDArray[np.float64]  # coordinates of the opposite position on this face, in [0, 1] (m, 2)
+    gap: NDArray[np.float64]  # distance along the normal at the point (m,), m
 
 
-class Contacts:
-    """The contacts of a stage.
+class Contacts(Touching):
+    """The contacts between groups in a stage.
 
     Parameters
     ----------
-    sides
-        Finder of the sides of the bodies.
-    materials
-        Materials of the scene.
-    contacts
-        Contacts by name.
+    setting, contacts
+        Data of the stage, and its contacts by name.
     """
 
-    def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Mapping[str, Contact]):
-        self.grid, self._materials = sides.grid, materials
-        self.names, self.contacts = tuple(contacts), tuple(contacts.values())
+    conditions, title = (Contact,), "contacts"
+
+    def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
+        super().__init__(setting, contacts)
+        sides, self.contacts = setting.sides, tuple(contacts.values())
         self._faces: list[tuple[Surface, Surface]] = []
         signs = []
         for contact in self.contacts:
             both = contact.groups(len(sides.bodies))
             faces = [sides.around(group) for group in both]
             whole = [_extent([sides.bodies[i] for i in group]) for group in both]
-            swap = whole[1] < whole[0]  # equal in all stages, for any order of the bodies
+            swap = whole[1] < whole[0]  # the same in all stages, and for any order of the bodies
             self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
             signs.append(-1.0 if swap else 1.0)
         self._signs = np.array(signs)
         self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
-        self._reach: Latest[NDArray[np.int64]] = Latest()
+        self._cell_pairs: Latest[NDArray[np.int64]] = Latest()
 
-    @property
-    def symmetric(self) -> bool:
-        """Whether the tangent is symmetric."""
-        return not any(contact.grips for contact in self.contacts)
-
-    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero contact histories of n points."""
-        return kept(dict(zip(self.names, self.contacts, strict=True)), n, self.grid.dim)
-
-    def placed(self, cut: CutDomains, points: MaterialPoints) -> tuple[ContactLaw, Origin, Callable, Callable]:
-        """Return the arguments of `ContactProblem` for a step, with the points at its start."""
-        found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
-        reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
-        begun = self._law(cut, points, found, cut.points, points, reach)
+    def placed(self, place: Place) -> Loads:
+        """Return the loads by contact between groups in a substep."""
+        cut, points = place.cut, place.points
+        found = self._found(cut.key, lambda: self._opposite_all(cut, cut.points), self.grid.comm)
+        cell_pairs = partial(self._cell_pairs, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
 
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
-            there = replace(points, corners=points.corners + moved)
-            return self._law(cut, points, self._met_all(cut, there), there, there, reach)
+            present = replace(points, corners=points.corners + moved)
+            return self._law(cut, points, self._opposite_all(cut, present), present, present, cell_pairs)
 
-        return *begun, again, reach
+        first_law = self._law(cut, points, found, cut.points, points, cell_pairs)
+        return ContactLoads(self, cut, *first_law, again, cell_pairs)
 
     def _law(
         self,
@@ -137,12 +119,12 @@ class Contacts:
         points: MaterialPoints,
         found: Sequence[tuple[Facets, Pairs]],
         seen: MaterialPoints,
-        there: MaterialPoints,
-        reach: Callable[[], NDArray[np.int64]],
+        present: MaterialPoints,
+        cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found at `seen`, with points that are now `there`.
+        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `present`.
 
-        points: at the start of the step, with the contact history.
+        `points` are the points at the start of the step, with the contact history.
         """
         grid = self.grid
         d = self.grid.dim
@@ -151,18 +133,18 @@ class Contacts:
         own = self._materials.table(cut.points, resistance)
         for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
-            now = facets if there is seen else self._facets(cut, others, there)
+            now = facets if present is seen else self._facets(cut, others, present)
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
-            if there is not points:
-                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, reach())
-                slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(there)[pairs.row])].all()
+            if present is not points:
+                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, cell_pairs())
+                slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(present)[pairs.row])].all()
                 off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
                 pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
             row = pairs.row
             other = pairs.facet
             at = patches.at[pairs.row]
             y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
-            area = patches.area(there)[row]
+            area = patches.area(present)[row]
             size = np.linalg.norm(area, axis=1)
             n = -patches.area(seen)[row]
             n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -170,32 +152,32 @@ class Contacts:
             if self.contacts[number].grips:
                 old = _turned(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
-            resists = np.minimum(own[at], now.resistance[other])
+            resistances = np.minimum(own[at], now.resistance[other])
             place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
-            scalars = np.stack([np.full(len(row), number), place, size, resists, pressure], axis=1)
-            apart = patches.now(there)[row] - y
-            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
+            scalars = np.stack([np.full(len(row), number), place, size, resistances, pressure], axis=1)
+            offset = patches.now(present)[row] - y
+            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, offset, old])))
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
-        travel = Exchange(grid.comm, grid.owner(cell))
-        cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
+        exchange = Exchange(grid.comm, grid.owner(cell))
+        cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, place = sent[:, :2].T.astype(np.int64)
-        x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
+        x, y, n, offset, shear = np.split(sent[:, 5:], 5, axis=1)
         own = number, grid.local(cell), *sent[:, 2:5].T, shear, x, self._signs
-        pairs = FacePairs(grid, *own, other, y, n, apart, place)
+        pairs = FacePairs(grid, *own, other, y, n, offset, place)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
-            travel, at, values[:, 0].astype(np.int64), values[:, 2]
+            exchange, at, values[:, 0].astype(np.int64), values[:, 2]
         )
 
-    def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
-        """Return the facets and pairs of each contact, see `_met`."""
-        return [self._met(cut, *faces, points) for faces in self._faces]
+    def _opposite_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
+        """Return the facets and pairs of each contact, see `_opposite`."""
+        return [self._opposite(cut, *faces, points) for faces in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of lexicographic cells (m,), first * cells + second, that pairs may occupy in the step.
+        """Return all pairs of cells (m,), as number first * cells + second, that contact pairs may occupy in the step.
 
-        These are the cells of the initial pairs, and all neighbouring cells.
+        These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells.
         """
         grid = self.grid
         keys = []
@@ -214,85 +196,90 @@ class Contacts:
         return np.unique(np.concatenate(keys))
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
-        """Return points on faces of all processes, at the present positions of the points."""
+        """Return the quadrature points of all processes on the faces, at the current positions of the points."""
         patches, d = cut.surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.face]]
         now, then = (
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
         )
-        resists = self._materials.table(cut.points, resistance)[patches.at]
+        resistances = self._materials.table(cut.points, resistance)[patches.at]
         area = patches.area(points)
         n = len(now)
         k = 2 ** (d - 1) * d
         outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         whole = np.column_stack([patches.face, patches.cell])
-        rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
+        rows = np.column_stack([patches.now(points), resistances, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
-        x, resists, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
+        x, resistances, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
         shape = (len(rows), 2 ** (d - 1), d)
-        return Facets(x, *whole.T, resists[:, 0], now.reshape(shape), then.reshape(shape), outward)
+        return Facets(x, *whole.T, resistances[:, 0], now.reshape(shape), then.reshape(shape), outward)
 
-    def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
-        """Return the facets of the other group, and the pairs between points on the faces and these facets."""
+    def _opposite(
+        self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
+    ) -> tuple[Facets, Pairs]:
+        """Return the facets of the other group, and the pairs of points on `faces` with these facets."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         count = min(CANDIDATES[d], len(facets.x))
-        if not count:  # the bodies of the other group are absent
+        if not count:  # no body of the other group is active
             none = np.zeros(0, dtype=np.int64)
             return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
-        reach = REACH * (self.grid.least if self.grid.even else self.grid.most) + self.grid.most
-        _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
+        largest = REACH * (self.grid.least if self.grid.even else self.grid.most) + self.grid.most
+        _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=largest)
         row, column = np.nonzero(near < len(facets.x))
         other = near[row, column]
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
         h = self._sizes(x[row])
-        met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * h) & (gap >= -DEEP * h)
-        row = row[met]
-        other = other[met]
-        t = t[met]
-        gap = gap[met]
+        valid = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * h) & (gap >= -DEEP * h)
+        row = row[valid]
+        other = other[valid]
+        t = t[valid]
+        gap = gap[valid]
         order = np.lexsort((np.abs(gap), row))
         order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) just inside faces at places x (m, d), if they hold a part of the face, else its own."""
+        """Return the cells (m,) just inside faces at positions x (m, d), or else the cells of the chosen facets.
+
+        A cell must contain a quadrature point of the face.
+        """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains are near another group and follow the Q1 field alone.
+        """Return which corners (n, 2^d, d) of domains are near another group, and follow the Q1 field alone.
 
-        points: at the start of the step.
+        `points` are the points at the start of the step.
         """
-        out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
-        reach = np.broadcast_to(reach, corners.shape[:2])
+        out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
+        largest = np.broadcast_to(largest, corners.shape[:2])
         for pair in self._faces:
             for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, points).x
-                mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
-                distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=BESIDE * self.grid.most)
-                out[mine] |= distance < reach[mine]
+                rows = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
+                distance, _ = cKDTree(x).query(corners[rows], distance_upper_bound=BESIDE * self.grid.most)
+                out[rows] |= distance < largest[rows]
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the shortest edges (...), m, of the cells at positions (..., d), m; one number for equal cells."""
+        """Return the shortest edges (...), m, of the cells at positions x (..., d), m; one number for equal cells."""
         return self.grid.least if self.grid.even else self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if groups overlap after a step, or may have passed through each other in it.
+        """Raise an error if groups overlap after a step, or may have passed through each other in the step.
 
         Raises
         ------
         NotConverged
-            With the place; a shorter step may succeed.
+            The message gives the position.  A shorter step may succeed.
         """
         h, comm = self._sizes(before.corners), self.grid.comm
         moved = points.corners - before.corners
@@ -306,16 +293,16 @@ class Contacts:
         if message := self._too_deep(cut, points):
             raise NotConverged(message)
 
-    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Raise an error if groups overlap at the start of a stage at time t (s)."""
-        if message := self._too_deep(cut, points):
-            raise ValueError(f"{message}, at the start t = {t:g} s, must touch or be apart")
+    def check_start(self, place: Place) -> None:
+        """Raise an error if groups overlap at the start of the stage."""
+        if message := self._too_deep(place.cut, place.points):
+            raise ValueError(f"{message}, at the start t = {place.start:g} s, must touch or be apart")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
-        """Return a message with the depth and place of an overlap of groups, "" if there is none."""
+        """Return a message with depth and position of an overlap of groups, or "" if none overlap."""
         h, comm = self.grid.least, self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
-            _, pairs = self._met(cut, faces, others, points)
+            _, pairs = self._opposite(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
@@ -324,29 +311,53 @@ class Contacts:
         return ""
 
 
+class ContactLoads(ContactProblem):
+    """Loads by contact between groups; the contact pairs follow the motion of the bodies.
+
+    Parameters
+    ----------
+    contacts, cut
+        Contacts, and cut particle domains.
+    law, origin, again, cell_pairs
+        See `ContactProblem`.
+    """
+
+    def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
+        super().__init__(law, origin, again=again, cell_pairs=cell_pairs)
+        self._contacts, self._cut = contacts, cut
+
+    def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
+        """Return which corners are near other groups."""
+        return self._contacts.near(self._cut, points, corners)
+
+    def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Raise an error if groups overlap after the step."""
+        self._contacts.check_end(self._cut, points, before)
+
+
 def _extent(bodies: Sequence[Body]) -> tuple:
-    """Return a sort key of a group of bodies: its surface area, then its seeded extent."""
+    """Return a key that sorts groups of bodies by surface area, then by seeded extent."""
     area = surface(bodies, None).area0.sum()
     corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
     return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return tractions (m, d), rotated by the smallest angle into the planes with normals n (m, d)."""
+    """Return shear tractions (m, d), rotated by the smallest angle into the planes with normals n (m, d)."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 
 def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions (m, d) at coordinates t (m, 2) in [0, 1] on faces (m, 2^(d-1), d)."""
+    """Return the positions (m, d) at face coordinates t (m, 2) in [0, 1] on faces (m, 2^(d-1), d)."""
     if corners.shape[2] == 2:
         return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
     return np.einsum("mk,mkd->md", weights(t), corners)
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return coordinates (m, 2) and distances (m,) where lines from x (m, d) along n meet faces (m, 2^(d-1), d)."""
+    """Return face coordinates (m, 2) and distances (m,) of intersections of lines from x along n (m, d) with faces."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

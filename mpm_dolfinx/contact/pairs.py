@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Possible contact pairs: quadrature points on a surface, each with a place on a tool or another group.
+"""Contact pairs: each pairs a quadrature point on a surface with a position on a tool or on another group.
 
-The relative displacement of a pair is w = B u.  B has the nodes of the point's cell and, for groups, of the
-other side.  A place on a tool moves with the tool.
+The relative displacement of a pair is w = B u.  The columns of B are the nodes of the point's cell and, between groups,
+the nodes of the cell on the other side.  A position on a tool moves with the tool.
 """
 
 from __future__ import annotations
@@ -28,58 +28,49 @@ from mpm_dolfinx.parallel.exchange import Exchange
 
 
 class Geometry(NamedTuple):
-    """Geometry of m pairs at some w.
+    """Geometry of m contact pairs at relative displacements w (m, d), m."""
 
-    gap (m,): gap, m, < 0 in penetration; n (m, d): d gap / dw, the outward unit normal of the other side; curvature (m,
-    d, d): second derivative, 1/m, None if zero; slip (m, d): slip in the step, m; arm (m, d): lever arm of moments, m;
-    shear (m, d): traction before the step, rotated with the tool, Pa.
-    """
-
-    gap: NDArray[np.float64]
-    n: NDArray[np.float64]
-    curvature: NDArray[np.float64] | None
-    slip: NDArray[np.float64]
-    arm: NDArray[np.float64]
-    shear: NDArray[np.float64]
+    gap: NDArray[np.float64]  # gap (m,), m; negative in penetration
+    n: NDArray[np.float64]  # derivative of the gap by w (m, d): the outward unit normal of the other side
+    curvature: NDArray[np.float64] | None  # second derivative of the gap (m, d, d), 1/m; None if zero
+    slip: NDArray[np.float64]  # slip in the step (m, d), m
+    arm: NDArray[np.float64]  # lever arm for moments (m, d), m
+    shear: NDArray[np.float64]  # shear traction before the step, rotated with the tool (m, d), Pa
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """m pairs in owned cells.
-
-    number, cell (m,): contact, local cell; area (m,): m^(d-1); resistance (m,): lower value of both sides, Pa, see
-    `conditions`; pressure (m,), shear (m, d): tractions at the points before the step, Pa; x (m, d): positions of the
-    points in the grid, m; sign (contacts,): sign of the forces on the points in the results.
-    """
+    """Contact pairs of m points in cells that this process owns."""
 
     grid: Grid
-    number: NDArray[np.int64]
-    cell: NDArray[np.int32]
-    area: NDArray[np.float64]
-    resistance: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    shear: NDArray[np.float64]
-    x: NDArray[np.float64]
-    sign: NDArray[np.float64]
+    number: NDArray[np.int64]  # number of the contact (m,)
+    cell: NDArray[np.int32]  # local cell of the point (m,)
+    area: NDArray[np.float64]  # area of the surface that the point represents (m,), m^(d-1)
+    resistance: NDArray[np.float64]  # reference modulus, the lower value of both sides (m,), Pa, see `conditions`
+    pressure: NDArray[np.float64]  # contact pressure at the point before the step (m,), Pa
+    shear: NDArray[np.float64]  # shear traction at the point before the step (m, d), Pa
+    x: NDArray[np.float64]  # position of the point in the undeformed grid (m, d), m
+    sign: NDArray[np.float64]  # sign of the forces on points in the results (contacts,)
 
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
-        """Return the geometry at w (m, d), m, for displacements of tools by loads (contacts,), m, in the step.
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
+        """Return the geometry at w (m, d), m.
 
-        travel: with free tools (contacts, q): displacements, m, and rotations, rad.
+        `motion` (contacts,), m, are displacements of tools by loads in the step.  With free tools its shape is
+        (contacts, q): displacements, m, and rotations, rad.
         """
         raise NotImplementedError
 
     @property
-    def reach(self) -> NDArray[np.float64] | float:
-        """Largest coordinate in the calculation of gaps, m; for each pair (m,), or for all."""
+    def largest_coordinate(self) -> NDArray[np.float64] | float:
+        """Largest coordinate in the computation of gaps, m: (m,) for each pair, or one value for all."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the lexicographic cells (m,) and shape functions (m, 2^d) of deformable other sides, else None."""
+        """Return lexicographic cells (m,) of other sides that deform, and their shape functions (m, 2^d), or None."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return B, which gives w (m d,), m, from the unknowns."""
+        """Return the matrix B, which maps the unknowns to w (m d,), m."""
         value, other = self.grid.shape_values(self.cell, self.x), self.other_side()
         if other is None:
             return at_nodes(self.grid, unknowns, self.cell, value)
@@ -88,19 +79,14 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class ToolPairs(Pairs):
-    """Points on faces that face tools.
+    """Contact pairs of points on a surface and tools.  Shear tractions are rotated with the tool."""
 
-    tools, poses (contacts,): tools, and their poses, with displacements by loads up to the start of the step; now,
-    carried (m, d): position of the point at the start of the step, and its image under the motion of the tool, m.
-    Shears are rotated with the tool.
-    """
+    tools: Sequence[Tool]  # (contacts,)
+    poses: Sequence[Pose]  # poses of the tools at the end of the substep, loads until its start included (contacts,)
+    now: NDArray[np.float64]  # position of the point at the start of the step (m, d), m
+    carried: NDArray[np.float64]  # this position after the motion of the tool (m, d), m
 
-    tools: Sequence[Tool]
-    poses: Sequence[Pose]
-    now: NDArray[np.float64]
-    carried: NDArray[np.float64]
-
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
         d = self.grid.dim
         m = len(w)
@@ -109,15 +95,15 @@ class ToolPairs(Pairs):
         n = np.zeros((m, d))
         second = np.zeros((m, d, d))
         middle = np.zeros((m, d))
-        gone = travel if travel.ndim > 1 else travel[:, None] * [tool.along(d) for tool in self.tools]
+        shift = motion if motion.ndim > 1 else motion[:, None] * [tool.along(d) for tool in self.tools]
         x = self.now + w
-        carried = self.carried + gone[self.number, :d]
+        carried = self.carried + shift[self.number, :d]
         shear = self.shear.copy()
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
                 solid, rows = tool.solid(h), np.flatnonzero(self.number == number)
-                before, pose = pose, pose.gone(gone[number])
+                before, pose = pose, pose.moved(shift[number])
                 if pose.R is not before.R:
                     turn = pose.R @ before.R.T
                     carried[rows] = pose.put(before.own(self.carried[rows]))
@@ -132,30 +118,25 @@ class ToolPairs(Pairs):
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
-    def reach(self) -> NDArray[np.float64]:
-        """See `Pairs`: user functions are evaluated at true positions, so these determine the rounding error."""
+    def largest_coordinate(self) -> NDArray[np.float64]:
+        """See `Pairs`.  User functions are evaluated at true positions, whose size decides the rounding error."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
 
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Points on the surface of one group, and opposite places along their normals on the faces of another.
+    """Contact pairs of points on the surface of one group with opposite positions on another group, along normals."""
 
-    other (m,): lexicographic cell of the other side; y (m, d): position of the place in the grid, m; n (m, d): its
-    outward normal; apart (m, d): from the place to the point, without the displacement of the step, m; place (m,):
-    number of the point, equal for all its pairs in a step.
-    """
+    other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
+    y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
+    n: NDArray[np.float64]  # outward unit normal of the other side there (m, d)
+    offset: NDArray[np.float64]  # vector from there to the point, without the displacement in the step (m, d), m
+    place: NDArray[np.int64]  # number of the point, the same in all updates of the pairs in a step (m,)
 
-    other: NDArray[np.int64]
-    y: NDArray[np.float64]
-    n: NDArray[np.float64]
-    apart: NDArray[np.float64]
-    place: NDArray[np.int64]
-
-    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`; moments refer to the positions at the start of the step."""
-        gap = np.einsum("md,md->m", self.n, self.apart + w)
+    def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
+        """See `Pairs`.  Moments refer to the positions at the start of the step."""
+        gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -164,7 +145,7 @@ class FacePairs(Pairs):
 
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process at positions x (m, d), m."""
+    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process, at positions x (m, d), m."""
     index = np.stack(np.unravel_index(cells % grid.cells, tuple(grid.shape)), axis=1)
     off = grid.in_cells(x) - index - 0.5
     return np.prod(0.5 + off[:, None] * grid.signs, axis=2)
@@ -177,17 +158,17 @@ def at_nodes(
     value: NDArray[np.float64],
     other: NDArray[np.int64] | None = None,
 ) -> PETSc.Mat:
-    """Return the matrix with values (m, 2^d) at the nodes of cells, component by component.
+    """Return the matrix with values (m, 2^d) in the columns of the nodes of cells, for each component.
 
-    other: lexicographic cells of any process; values (m, 2 * 2^d) then include their nodes.
+    `other` are lexicographic cells of any process.  With them, values (m, 2 * 2^d) include the other nodes.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
-        travel = Exchange(grid.comm, grid.owner(other))
-        there = travel.back(numbers[grid.cell_nodes[grid.local(travel.send(other))]])
-        column = np.concatenate([column, there], axis=1)
+        exchange = Exchange(grid.comm, grid.owner(other))
+        columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
+        column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)
     value, m = np.broadcast_to(value[:, None], (len(value), d, value.shape[1])), len(cell) * d
     row = np.broadcast_to(np.arange(m).reshape(-1, d, 1), column.shape)
@@ -197,7 +178,7 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return a matrix of this process's rows, with `columns` local columns; own: whether all entries are local."""
+    """Return the matrix with these rows of this process, and `columns` local columns.  `own`: all entries are local."""
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
@@ -207,7 +188,7 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
-    """Raise an error for a user function that is not a signed distance near the tool."""
+    """Raise an error if a user function is no signed distance near the tool: its slope differs from 1."""
     size = np.linalg.norm(n, axis=1)
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):

@@ -2,22 +2,22 @@
 """Contact problem of a substep, with tools or between groups of bodies.
 
 With the relative displacements w = B u of the pairs, nodal forces are B^T f(w).  Forces on both bodies are therefore
-equal and opposite within rounding.  For two deformable sides, pairs, normals and gaps are at first taken from the
-start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This ends
-when the gaps match the faces at the end of the step.
+equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken at the start of the
+step.  After convergence they are updated at the new positions, and the step is solved again.  This is repeated until
+the gaps match the faces at the end of the step.
 
-The displacement a of a load-controlled tool along its direction e is one more unknown.  Let f(w - a e) be the forces on
-points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with the
-equilibrium of the bodies, by
+A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
+the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
+the equilibrium of the bodies, by
 
-    da = (e . D dw + load - e . f) / s,
+    da = (e . D dw + load - e . f) / s.
 
-so forces are f + D e (load - e . f) / s, and minus their derivative is D - (D e) (e . D) / s.
+Forces are therefore f + D e (load - e . f) / s; minus their derivative is D - (D e) (e . D) / s.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -31,86 +31,110 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
-from mpm_dolfinx.conditions.acting import At, Loads
-from mpm_dolfinx.contact.history import Origin
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
+from mpm_dolfinx.contact.history import Origin, Rough, pressure_name, shear_name
 from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-FOLLOWS = 8  # largest number of pair updates in a step
+FOLLOWS = 8  # largest number of updates of the pairs in a step
 
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """Loads of k tools: names for errors; start (k,): displacement by the load before the step, m; direction (k, d):
-    unit vectors; load (k,): N, nan without.
-    """
+    """Loads of k load-controlled tools."""
 
-    names: Sequence[str]
-    start: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    load: NDArray[np.float64]
+    names: Sequence[str]  # of the tools, for error messages
+    start: NDArray[np.float64]  # displacement by the load before the step (k,), m
+    direction: NDArray[np.float64]  # unit vector of the load (k, d)
+    load: NDArray[np.float64]  # load (k,), N; nan for tools without a load
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
-    """Linearised displacements of k load-controlled tools in the step: way (k,), m, at w (m, d), m, and elsewhere
+class LinearMotion:
+    """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-        way + shift + sum slope . (w' - w),
-
-    with the sum over the pairs (m,) of each tool; Newton's method follows this line.
+    The displacements are motion + shift + sum slope . (w' - w); the sum is over the pairs of a tool.  Newton's method
+    uses this line.
     """
 
-    w: NDArray[np.float64]
-    way: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    slope: NDArray[np.float64]
+    w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
+    motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
+    shift: NDArray[np.float64]  # Newton increment of these displacements (k,), m
+    slope: NDArray[np.float64]  # derivative by the relative displacements of each pair (m, d)
 
 
 class Found(NamedTuple):
-    """Contact at some displacement: geometry, forces, and displacements of tools by loads (k,), m.
+    """Contact at given displacements."""
 
-    balanced (m, d): forces on the points, N, after the tools' Newton increment towards equilibrium with their loads.
-    """
-
-    at: Geometry
-    touch: Touch
-    travel: NDArray[np.float64]
-    balanced: NDArray[np.float64]
+    at: Geometry  # geometry of the pairs
+    touch: Touch  # forces of the pairs
+    motion: NDArray[np.float64]  # displacements of tools by loads (k,), m
+    balanced: NDArray[np.float64]  # forces on points after the Newton increment of the tools (m, d), N
 
 
 class Current(NamedTuple):
-    """Contact law of the present pairs, their origin, and the state of the iterations."""
+    """Contact law of the current pairs, their material points, state of the iterations, and motions of tools."""
 
     law: ContactLaw
     origin: Origin
     state: ContactState
-    ways: Ways | None = None
+    linear: LinearMotion | None = None
 
 
-class Gone(NamedTuple):
-    """Motion of tools in a substep with time weight own, s: their poses, and the flight of free tools."""
+class SubstepMotion(NamedTuple):
+    """Motion of tools in a substep with time weight `own`, s: their poses, and the `Flight` of free tools."""
 
     own: float
     poses: Any
     flight: Any = None
 
 
+class Touching(Acting):
+    """Contact conditions of one kind in a stage: either tools, or contacts between groups.
+
+    Parameters
+    ----------
+    setting, given
+        Data of the stage, and its tools or contacts by name.
+    """
+
+    linear = False
+
+    def __init__(self, setting: Setting, given: Mapping[str, Rough]):
+        self.grid, self._materials = setting.grid, setting.materials
+        self.names = tuple(given)
+        self._grips = [one.grips for one in given.values()]
+        self.symmetric = not any(self._grips)
+
+    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return zero histories of n points: pressures (n,), Pa, and tractions (n, d), Pa, if contacts resist slip."""
+        out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
+        for name, grips in zip(self.names, self._grips, strict=True):
+            out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
+        return out
+
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return forces and moments on the bodies, all filled with this value."""
+        rows = np.full((len(self.names), 3 if self.grid.dim == 2 else 6), value)
+        return {"tool_forces": dict(zip(self.names, rows, strict=True))}
+
+
 class ContactProblem(Loads):
-    """Contact as a load; `now` is replaced during the solution.
+    """Contact forces in a substep.  `now` is replaced during the solution.
 
     Parameters
     ----------
     law, origin
-        Contact law at the start of the step, and origin of its pairs.
+        Contact law at the start of the step, and the material points of its pairs.
     pushes
         Loads of tools.
     again
-        Function that returns law and origin of the pairs at displacements, a local array, m, see `FacePairs`.
-    reach
-        Function that returns all pairs of lexicographic cells of this process's pairs, first * cells + second.
+        Function from displacements, a local array, m, to law and origin of the pairs there, see `FacePairs`.
+    cell_pairs
+        Function that returns all pairs of lexicographic cells of this process's pairs, as first * cells + second.
     """
 
     linear, smooth, touches = False, False, True
@@ -121,46 +145,51 @@ class ContactProblem(Loads):
         origin: Origin,
         pushes: Pushes | None = None,
         again: Callable[[NDArray[np.float64]], tuple[ContactLaw, Origin]] | None = None,
-        reach: Callable[[], NDArray[np.int64]] | None = None,
+        cell_pairs: Callable[[], NDArray[np.int64]] | None = None,
     ):
         self.grid = law.grid
         self.pushes = pushes
         self._again = again
-        self._reach = reach
+        self._cell_pairs = cell_pairs
         self.now = Current(law, origin, law.begins())
         self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
         self._found: Latest[Found] = Latest()
         if self.pushed:
-            self.now = self.now._replace(ways=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
+            self.now = self.now._replace(linear=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
 
     @property
     def pairs(self) -> Pairs:
-        """The present pairs."""
+        """The current contact pairs."""
         return self.now.law.pairs
 
     @property
     def pushed(self) -> bool:
-        """Whether loads push tools."""
+        """Whether any tool is load-controlled."""
         return self.pushes is not None and not np.isnan(self.pushes.load).all()
 
     @property
     def couples(self) -> bool:
         """Whether the contact couples nodes of different cells."""
-        return self.pushed or self._reach is not None
+        return self.pushed or self._cell_pairs is not None
+
+    @property
+    def _still(self) -> NDArray[np.float64]:
+        """No displacements by loads: (k,), or (k, q) with free tools."""
+        return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
 
     def found(self, at: At) -> Found:
-        """Return the contact at u."""
+        """Return the contact at the displacements u."""
         key = self.now, at.unknowns, at.u[at.unknowns.owned]
         return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
-        """Return w (m, d), m, of the pairs of a law."""
+        """Return the relative displacements w (m, d), m, of the pairs of a law."""
         B, w = self._B(law, at.unknowns)
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         return w.array_r.reshape(-1, self.grid.dim).copy()
 
     def _B(self, law: ContactLaw, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
-        """Return B of the pairs of a law, and a vector for its product."""
+        """Return the matrix B of the pairs of a law, and a vector for products with B."""
 
         def make() -> tuple[PETSc.Mat, PETSc.Vec]:
             B = law.pairs.operator(unknowns)
@@ -169,30 +198,30 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._way(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
+        return self._find_at(w, self._motion(w) if self.pushed else self._still)
 
-    def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
+    def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         law = self.now.law
         state = self.now.state
         of = self.pairs.number
-        at = law.pairs.at(w, way)
+        at = law.pairs.at(w, motion)
         touch = law.touch(state, at)
-        found = Found(at, touch, way, touch.force)
+        found = Found(at, touch, motion, touch.force)
         if not self.pushed:
             return found
         more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
         return found._replace(balanced=touch.force + more)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract the forces at u."""
+        """Subtract the contact forces at u."""
         B, w = self._B(self.now.law, at.unknowns)
         w.array_w[:] = -self.found(at).balanced.ravel()
         B = B if on is at.unknowns else self.pairs.operator(on)
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the pattern of `coupling` in the step, beyond that of cells; None if none."""
-        out = self._pattern_of_pairs(unknowns) if self._reach is not None else None
+        """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
+        out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
         for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
             more = outer(own, own)
@@ -202,11 +231,11 @@ class ContactProblem(Loads):
         return out
 
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a matrix with the pattern of pairs that follow the bodies."""
+        """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
-        cell, other = np.divmod(self._reach(), len(grid.owners))
-        travel = Exchange(grid.comm, grid.owner(cell))
-        cell, other = travel.send(cell), travel.send(other)
+        cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
+        exchange = Exchange(grid.comm, grid.owner(cell))
+        cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
         together = scipy.sparse.identity(m)
@@ -219,7 +248,7 @@ class ContactProblem(Loads):
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
-        collect_garbage(self.grid.comm)  # pairs with friction fill 60 MB for 12 cells in 3D, in each iteration
+        collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
         found = self.found(at)
         law = self.now.law
         unknowns = at.unknowns
@@ -228,7 +257,7 @@ class ContactProblem(Loads):
         K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
         if not self.pushed:
             return K
-        _, slope, _ = self._met(found)
+        _, slope, _ = self._reactions(found)
         for k in np.flatnonzero((slope > 0) & ~np.isnan(self.pushes.load)):
             e = self.pushes.direction[k] * (self.pairs.number == k)[:, None]
             sides = (self._nodal(unknowns, law.slope(touch, where, e, adjoint)) for adjoint in (False, True))
@@ -236,42 +265,44 @@ class ContactProblem(Loads):
         return K
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return B^T of values (m, d) at the pairs."""
+        """Return B^T v for values v (m, d) at the pairs."""
         B, w = self._B(self.now.law, unknowns)
         w.array_w[:] = values.ravel()
         out = unknowns.vector()
         B.multTranspose(w, out)
         return out
 
-    def _way(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (tools,), m, by loads at w (m, d), m, along the last Newton step."""
-        ways, h = self.now.ways, self.grid.least
-        if not over_all(self.grid.comm, int((w != ways.w).any())):
-            return ways.way
-        more = self.now.law.by_contact((ways.slope * (w - ways.w)).sum(axis=1)[:, None])[:, 0]
-        return np.clip(ways.way + ways.shift + more, -h, h)
+    def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacements (tools,), m, of tools by loads at w (m, d), m, from the last linearisation."""
+        linear, h = self.now.linear, self.grid.least
+        if not over_all(self.grid.comm, int((w != linear.w).any())):
+            return linear.motion
+        more = self.now.law.by_contact((linear.slope * (w - linear.w)).sum(axis=1)[:, None])[:, 0]
+        return np.clip(linear.motion + linear.shift + more, -h, h)
 
-    def _linearised(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Ways:
-        """Return the linearised displacements of tools."""
+    def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
+        """Return the displacements of tools, linearised about `motion` (tools,), m, for pairs at w (m, d), m."""
         law, of = self.now.law, self.pairs.number
-        at, touch, *_ = found = self._find_at(w, way)
-        _, slope, _ = self._met(found)
+        at, touch, *_ = found = self._find_at(w, motion)
+        _, slope, _ = self._reactions(found)
         by = np.divide(1, slope, out=np.zeros(len(slope)), where=slope > 0)
         shift = self._shift(found)
-        return Ways(w, way, shift, by[of, None] * law.slope(touch, at, self.pushes.direction[of], adjoint=True))
+        slope = law.slope(touch, at, self.pushes.direction[of], adjoint=True)
+        return LinearMotion(w, motion, shift, by[of, None] * slope)
 
-    def _met(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _reactions(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the reactions along the loads (tools,), N, their derivatives, N/m, and their rounding errors, N."""
         law, e = self.now.law, self.pushes.direction[self.pairs.number]
         slope = law.slope(found.touch, found.at, e)
-        met, slope = law.by_contact(np.stack([(e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)], axis=1)).T
+        both = (e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)
+        reaction, slope = law.by_contact(np.stack(both, axis=1)).T
         off = law.rounding(self.now.state) * (found.touch.stiff > 0)
-        return met, slope, law.by_contact(off[:, None])[:, 0]
+        return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the displacements (tools,), m, at which a single place would bear the load, and which tools touch.
+        """Return the displacements (tools,), m, at which one contact point would carry the load, and which tools touch.
 
-        Infinity if there is no such place.
+        A displacement is infinite if there is no such point.
         """
         law = self.now.law
         state = self.now.state
@@ -286,40 +317,40 @@ class ContactProblem(Loads):
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
 
     def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return the Newton increments (tools,), m, of tools towards equilibrium with their loads."""
-        met, slope, _ = self._met(found)
-        off = np.nan_to_num(self.pushes.load - met)
+        """Return the Newton increments (tools,), m, with which reactions approach the loads."""
+        reaction, slope, _ = self._reactions(found)
+        off = np.nan_to_num(self.pushes.load - reaction)
         far, touches = self._seek(found)
-        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # pure slip does not stiffen
+        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # slip alone has no stiffness
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return initial displacements (tools,), m, for fixed bodies, at most until a single place bears the load."""
-        way = np.zeros(len(self.now.law.contacts))
+        """Return initial displacements (tools,), m, for fixed bodies, at most until one point carries the load."""
+        motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
         for _ in range(ROUNDS):
-            found = self._find_at(still, way)
-            before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
-            if np.abs(way - before).max() <= EPSILON * self.grid.reach:
+            found = self._find_at(still, motion)
+            before, motion = motion, np.clip(motion + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
+            if np.abs(motion - before).max() <= EPSILON * self.grid.reach:
                 break
-        return way
+        return motion
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update the slipping set at u and, if sticks, returns to stick; return whether the set changed."""
+        """See `Loads`.  The slipping set consists of the conditions that slip."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
-        way = self.found(at).travel
+        motion = self.found(at).motion
         if self.now.law.grips:
             state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
             self.now = self.now._replace(state=state)
         if self.pushed:
-            self.now = self.now._replace(ways=self._linearised(w, way))
+            self.now = self.now._replace(linear=self._linearised(w, motion))
         return changed
 
     def augment(self, at: At) -> bool:
         """Augment the pressures if mean penetrations at u are too large; return whether forces changed.
 
-        Otherwise move tools whose reaction differs from their load.
+        If penetrations are small enough, move tools whose reaction differs from the load.
         """
         found = self.found(at)
         law = self.now.law
@@ -328,25 +359,26 @@ class ContactProblem(Loads):
         self.now = self.now._replace(state=new)
         if new is not state or not self.pushed:
             return new is not state
-        met, slope, unknown = self._met(found)
+        reaction, slope, unknown = self._reactions(found)
         load, h = self.pushes.load, self.grid.least
-        off = np.nan_to_num(met - load)
+        off = np.nan_to_num(reaction - load)
         wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
         if not wrong.any():
             return False
         _, touches = self._seek(found)
-        lost = wrong & ((found.travel >= h) | (touches & (slope <= 0)))
-        for k in np.flatnonzero(lost)[:1]:
-            why = f"the reaction is {met[k]:.6g} N for any displacement: do the bodies constrain it?"
-            if met[k] == 0:
+        failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
+        for k in np.flatnonzero(failed)[:1]:
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain it?"
+            if reaction[k] == 0:
                 why = "there is no contact within a cell: does it begin at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
-        ways = self.now.ways
-        self.now = self.now._replace(ways=self._linearised(ways.w, np.clip(ways.way + ways.shift * wrong, -h, h)))
+        linear = self.now.linear
+        motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
+        self.now = self.now._replace(linear=self._linearised(linear.w, motion))
         return True
 
     def follow(self, at: At) -> bool:
-        """Update the pairs at u, a local array, m; return whether this changes the equilibrium."""
+        """Update the pairs at u; return whether this changes the equilibrium."""
         if self._again is None or self.now.state.follows == FOLLOWS:
             return False
         new = Current(*self._again(at.u), self.now.state)
@@ -357,48 +389,48 @@ class ContactProblem(Loads):
         return True
 
     def _continued(self, new: Current, at: At) -> tuple[Current, float]:
-        """Return the contact with pairs found at u, and the largest difference of gaps from the present ones, cells.
+        """Return the contact with pairs found at u, and the largest change of a gap from the current pairs, cells.
 
-        Pairs that are open in both are ignored.
+        Pairs that are open before and after are ignored.
         """
         found = self.found(at)
         law = self.now.law
         state = self.now.state
         pairs = new.law.pairs
-        gap = np.einsum("md,md->m", pairs.n, pairs.apart)
-        pairs = replace(pairs, apart=pairs.apart - self._apart_by(new.law, at))
+        gap = np.einsum("md,md->m", pairs.n, pairs.offset)
+        pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
         now = ContactLaw(law.names, law.contacts, pairs)
         fresh = now.begins()
-        _, here, there = np.intersect1d(now.key, law.key, return_indices=True)
+        _, new_at, old_at = np.intersect1d(now.key, law.key, return_indices=True)
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
-            values[here] = getattr(state, name)[there]
+            values[new_at] = getattr(state, name)[old_at]
         fresh = replace(fresh, **carried, raised=state.raised, follows=state.follows + 1)
-        _, row, there = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
+        _, row, old_at = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
         push = found.touch.push
-        off, lost = np.maximum(-gap, 0.0), push > 0
-        off[row] = np.where((push[there] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[there]), 0.0)
-        lost[there] = False
-        most = float(off.max(initial=0.0)) / self.grid.least if not lost.any() else np.inf
+        off, missing = np.maximum(-gap, 0.0), push > 0
+        off[row] = np.where((push[old_at] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[old_at]), 0.0)
+        missing[old_at] = False
+        most = float(off.max(initial=0.0)) / self.grid.least if not missing.any() else np.inf
         return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with the contact pressures and shear tractions at u."""
+        """Return the points with updated contact pressures and shear tractions at u."""
         law, origin, *_ = self.now
         contacts = dict(zip(law.names, law.contacts, strict=True))
         found = self.found(at)
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`: only tools do work; elastic slip in stick is counted as dissipation, and returned on unloading.
+        """See `Loads`.  Only tools do work.  Elastic slip in stick counts as dissipation, and is returned on unloading.
 
-        Pressures count as doing no work, because velocities of substeps jump where a gap closes in a step.
+        Contact pressures are taken to do no work: velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)
-        B, apart = self._B(law, at.unknowns)
-        B.mult(at.unknowns.gather_owned(v[at.unknowns.owned]), apart)
-        moves = apart.array_r.reshape(-1, self.grid.dim)
+        B, relative = self._B(law, at.unknowns)
+        B.mult(at.unknowns.gather_owned(v[at.unknowns.owned]), relative)
+        moves = relative.array_r.reshape(-1, self.grid.dim)
         tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
         shear = law.pairs.area[:, None] * found.touch.shear[law.of]
         # `push` has counted the power of the tools as a part of the nodes' power
@@ -406,20 +438,20 @@ class ContactProblem(Loads):
         return -float((shear * (moves - tool)).sum()), more
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """Return the velocities (m, d), m/s, of places on tools; zero for two deformable sides."""
+        """Return the velocities (m, d), m/s, of contact positions on tools; zero if both sides deform."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and displacements by loads, m."""
-        where, touch, travel, _ = self.found(at)
+        """See `Loads`: forces and moments on the bodies, (3,) or in 3D (6,), N, N m, and displacements by loads, m."""
+        where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
         if self.pushes is not None:
-            out["tool_travel"] = dict(zip(names, self.pushes.start + travel, strict=True))
+            out["tool_travel"] = dict(zip(names, self.pushes.start + motion, strict=True))
         return out
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:
-        """Return cells (m,), cells of deformable other sides, positions and directions (m, d) of initial contact."""
+        """See `Loads`.  With friction or adhesion, contact constrains all directions."""
         at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
         law = self.now.law
         d = self.grid.dim
@@ -431,7 +463,7 @@ class ContactProblem(Loads):
         return self.pairs.cell[rows], None if other is None else other[0][rows], self.pairs.x[rows], along
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors, which include gaps between large coordinates."""
+        """See `Loads`.  Gaps are differences of large coordinates."""
         if self.pairs.other_side() is not None:
             return of_cells
         out, cells = of_cells.copy(), self.pairs.cell
@@ -440,14 +472,14 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error of forces in cells of other sides, N."""
+        """Rounding error of forces in cells of other sides that deform, N."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
-    """Return a b^T without zero rows and columns."""
+    """Return the matrix a b^T, without entries in zero rows and columns."""
     start, comm = b.owner_range[0], b.comm.tompi4py()
     rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
     at, value = start + columns, b.array_r[columns]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Shapes of rigid tools: signed distances, m, positive outside, in the initial position of the tool."""
+"""Shapes of rigid tools: signed distances, m, positive outside, for the initial position of the tool."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SECOND, TINY
+from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SAME, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-ROUNDED = 1e-9  # cells: penetration that counts as on the surface
+ROUNDED = SAME  # cells: a position penetrating less than this lies on the surface
 DISTANCE = 0.1
-"""Relative error of the slope above which a user function is no distance."""
+"""Largest deviation of the slope of a user's distance function from 1."""
 
 
 class Shape(Protocol):
-    """A solid; positions y (m, d) are in the frame of the tool."""
+    """A rigid solid.  Positions y (m, d), m, refer to the frame of the tool."""
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m."""
+        """Return the signed distances (m,), m, from the surface."""
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
@@ -38,21 +38,21 @@ def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return lengths (m,), m, and directions of vectors (m, d), m, and second derivatives of the lengths, 1/m."""
+    """Return lengths (m,), m, of vectors (m, d), m, their directions, and second derivatives of the lengths, 1/m."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
 
 
 class Uniform(NamedTuple):
-    """Uniform solid in 2D: centroid (d,), m, and squared radius of gyration about it, m^2."""
+    """Uniform solid in 2D: centroid (d,), m, and squared radius of gyration about the centroid, m^2."""
 
     centroid: NDArray[np.float64]
     gyration: float
 
 
 def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return a unit vector (d,); ValueError for an invalid or zero vector."""
+    """Return the unit vector (d,) along a vector; raise ValueError if the vector is invalid or zero."""
     v = numbers(name, value, (2,), (3,), allowed="a vector of 2 or 3 finite components, not zero")
     if not v.any():
         raise ValueError(f"{name} = {line(value)}, must be a vector of 2 or 3 finite components, not zero")
@@ -62,14 +62,14 @@ def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """The half-space behind a plane: a plate, a wall, the ground.
+    """The half-space behind a plane, for a plate, a wall, or the ground.
 
     Parameters
     ----------
     point : (d,), m
         A position on the plane.
     outward : (d,)
-        Normal of the plane, out of the tool towards the bodies; of any length.
+        Normal of the plane, of any length, pointing out of the tool towards the bodies.
     """
 
     point: ArrayLike
@@ -84,11 +84,11 @@ class HalfSpace:
 
     @property
     def dim(self) -> int:
-        """Number of coordinates."""
+        """Number d of dimensions."""
         return len(self._n)
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m."""
+        """Return the signed distances (m,), m, from the surface."""
         return (y - self.point) @ self._n
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,7 +100,7 @@ class HalfSpace:
         return _flat(y)
 
     def moved(self, by: NDArray[np.float64]) -> HalfSpace:
-        """Return the shape, moved by a vector (d,), m."""
+        """Return the shape, translated by a vector (d,), m."""
         return replace(self, point=np.asarray(self.point) + by)
 
 
@@ -111,7 +111,9 @@ class Ball:
     Parameters
     ----------
     centre : (d,), m
-        Its centre.
+        Centre of the sphere.
+    radius
+        Radius, m, > 0.
     radius
         m, > 0.
     """
@@ -125,11 +127,11 @@ class Ball:
 
     @property
     def dim(self) -> int:
-        """Number of coordinates."""
+        """Number d of dimensions."""
         return len(np.asarray(self.centre))
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m."""
+        """Return the signed distances (m,), m, from the surface."""
         return _across(y - self.centre)[0] - self.radius
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -141,7 +143,7 @@ class Ball:
         return _across(y - self.centre)[2]
 
     def moved(self, by: NDArray[np.float64]) -> Ball:
-        """Return the shape, moved by a vector (d,), m."""
+        """Return the shape, translated by a vector (d,), m."""
         return replace(self, centre=np.asarray(self.centre) + by)
 
 
@@ -149,13 +151,13 @@ class Ball:
 class Convex:
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
-    The distance is the largest one to its planes.  It is exact inside; outside, next to edges and corners, it is
-    too small, but there is no contact there.
+    The signed distance is the largest distance from the planes of the surface.  This is exact inside.  Outside, near
+    edges and corners, it is too small; but there is no contact.
 
     Parameters
     ----------
     corners : (m, d), m
-        At least d + 1 corners, not in one line or plane.
+        At least d + 1 corners, not all on one line or plane.
     """
 
     corners: ArrayLike
@@ -178,18 +180,18 @@ class Convex:
 
     @property
     def dim(self) -> int:
-        """Number of coordinates."""
+        """Number d of dimensions."""
         return self._planes.shape[1] - 1
 
     def _each(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         return y @ self._planes[:, :-1].T + self._planes[:, -1]
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m."""
+        """Return the signed distances (m,), m, from the surface."""
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance; the mean normal of equally near planes."""
+        """Return the gradients (m, d) of the distance; at equal distances from planes, the mean of their normals."""
         each = self._each(y)
         near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
         return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
@@ -199,12 +201,12 @@ class Convex:
         return _flat(y)
 
     def moved(self, by: NDArray[np.float64]) -> Convex:
-        """Return the shape, moved by a vector (d,), m."""
+        """Return the shape, translated by a vector (d,), m."""
         return replace(self, corners=np.asarray(self.corners) + by)
 
 
 def uniform(shape: Ball | Convex) -> Uniform:
-    """Return a disc or polygon as a uniform solid, a polygon from the triangles between its edges and one corner."""
+    """Return centroid and radius of gyration of a disc or polygon.  A polygon is divided into triangles at a corner."""
     if isinstance(shape, Ball):
         return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
     hull = ConvexHull(np.asarray(shape.corners, dtype=float))
@@ -224,11 +226,13 @@ class Cone:
     Parameters
     ----------
     tip : (d,), m
-        Its tip.
+        Tip of the cone.
+    axis : (d,)
+        Direction from the tip into the tool, of any length.
     axis : (d,)
         Direction from the tip into the tool; of any length.
     angle_deg
-        Angle between axis and flank, degrees, in (0, 90); 30 for a CPT cone.
+        Angle between axis and flank, degrees, in (0, 90); 30 for the cone of a CPT.
     """
 
     tip: ArrayLike
@@ -245,11 +249,11 @@ class Cone:
 
     @property
     def dim(self) -> int:
-        """Number of coordinates."""
+        """Number d of dimensions."""
         return len(self._axis)
 
     def _polar(self, y: NDArray[np.float64]) -> tuple:
-        """Return heights (m,) above the tip, and `_across` of the offsets from the axis."""
+        """Return heights (m,) above the tip, and the results of `_across` for the offsets from the axis."""
         z = (y - self.tip) @ self._axis
         return z, *_across(y - self.tip - z[:, None] * self._axis)
 
@@ -274,24 +278,24 @@ class Cone:
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
 
     def moved(self, by: NDArray[np.float64]) -> Cone:
-        """Return the shape, moved by a vector (d,), m."""
+        """Return the shape, translated by a vector (d,), m."""
         return replace(self, tip=np.asarray(self.tip) + by)
 
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape by a user's signed distance function, with derivatives by finite differences.
+    """A shape given by a user's signed distance function, with derivatives by finite differences.
 
-    size: cell size, m, the scale of increments; base (d,): origin of positions, m, because the function is evaluated at
-    true positions.  Increments are powers of two, so distinct positions do not round to the same value.
+    The function is evaluated at true positions.  Increments are powers of two, so that distinct positions do not round
+    to the same value.
     """
 
-    function: Callable[[NDArray[np.float64]], ArrayLike]
-    size: float
-    base: NDArray[np.float64] | float = 0.0
+    function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m
+    size: float  # cell size, to which increments are proportional, m
+    base: NDArray[np.float64] | float = 0.0  # origin of the positions (d,), m
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m."""
+        """Return the signed distances (m,), m, from the surface."""
         return self._at(y + self.base)
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -320,5 +324,5 @@ class Distance:
 
 
 def _power_of_two(x: float) -> float:
-    """Return the power of two nearest to a number."""
+    """Return the power of two that is nearest to a number."""
     return float(2.0 ** np.rint(np.log2(x)))

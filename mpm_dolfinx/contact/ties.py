@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Tied sides: two opposite sides of the ground move alike, as if it went on beyond them.
+"""Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-A penalty on the difference of the displacements of places at equal height, k/2 int |u_one - u_other|^2 dA.  It is
-measured from the seeded positions, so its error does not accumulate.  Forces on both sides are equal and opposite.
+A penalty resists the difference of the displacements at equal heights: k/2 int |u_one - u_other|^2 dA.  Displacements
+are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and opposite.
 """
 
 from __future__ import annotations
@@ -28,22 +28,23 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 class Tie:
-    """Two opposite sides, and the faces that belong together.
+    """Two opposite tied sides, and the faces at equal heights.
 
-    partner (m,): face of the other side for each face of one side; way (m, d): from one to the other, m; axis: normal.
+    `partner` (m,) is the face of the other side for each face of one side.  `offset` (m, d), m, is the vector between
+    both faces.  `axis` is the axis normal to them.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
         self.one, self.other = one, other
         self.axis = int(one.face[0]) // 2
-        at, there = one.places().mean(axis=1), other.places().mean(axis=1)
+        at, opposite = one.places().mean(axis=1), other.places().mean(axis=1)
         along = np.arange(at.shape[1]) != self.axis
-        off, self.partner = cKDTree(there[:, along]).query(at[:, along])
+        off, self.partner = cKDTree(opposite[:, along]).query(at[:, along])
         alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
         small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
         if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
             raise ValueError(f"{line(tied)}: sides, must be opposite sides of a box with equal faces")
-        self.way = there[self.partner] - at
+        self.offset = opposite[self.partner] - at
 
 
 class Ties(Acting):
@@ -52,12 +53,12 @@ class Ties(Acting):
     Parameters
     ----------
     setting, ties
-        The stage, and its tied sides by name.
+        Data of the stage, and the tied sides by name.
 
     Raises
     ------
     ValueError
-        The sides are not opposite, or have other faces.
+        The sides are not opposite, or their faces differ.
     """
 
     conditions, title = (Tied,), "tied sides"
@@ -73,20 +74,20 @@ class Ties(Acting):
         return [tie.one for tie in self._ties]
 
     def placed(self, place: Place) -> Loads:
-        """Return the penalty in a substep."""
+        """Return the penalty forces in a substep."""
         grid, points = self._grid, place.points
         d, rows = grid.dim, []
         modulus = self._materials.table(points, holding)
         for tie in self._ties:
             p = place.cut.surface(tie.one)
-            here, at = points.find(tie.other.id)
+            present, at = points.find(tie.other.id)
             moved = np.zeros((len(tie.other), 2**d, d))
-            moved[here] = points.corners[at] - points.origin[at]
+            moved[present] = points.corners[at] - points.origin[at]
             moved = grid.comm.allreduce(moved)
             across = p.xi * np.where(np.arange(d) == tie.axis, -1.0, 1.0)
             gap = p.now(points) - p.origin(points) - interpolate(moved[tie.partner[p.face]], across)
-            y = p.x + tie.way[p.face]
-            inside = y - NEAR * np.sign(tie.way[p.face, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
+            y = p.x + tie.offset[p.face]
+            inside = y - NEAR * np.sign(tie.offset[p.face, [tie.axis]])[:, None] * grid.least * np.eye(d)[tie.axis]
             other = grid.number(grid.index_from_base(inside)) + p.cell // grid.cells * grid.cells
             area = np.linalg.norm(p.area(points), axis=1)
             stiffness = HOLD * modulus[p.at] * area / grid.sizes_at(p.x).min(axis=-1)
@@ -98,16 +99,16 @@ class Ties(Acting):
 
 
 class TieLoads(Loads):
-    """Tied sides in a substep.
+    """Penalty forces of tied sides in a substep.
 
     Parameters
     ----------
     cell, x : (m,), (m, d), m
-        Local cells and positions on one side.
+        Local cells, and positions in them, on one side.
     other, y : (m,), (m, d), m
-        Lexicographic cells and positions on the other side.
+        Lexicographic numbers of cells of any process, and positions in them, on the other side.
     stiffness : (m,), N/m
-        Penalties.
+        Penalty stiffness.
     gap : (m, d), m
         Differences of displacements at the start of the step.
     """
@@ -121,11 +122,11 @@ class TieLoads(Loads):
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix that gives differences of displacements (m d,), m, from the unknowns."""
+        """Return the matrix B, which maps the unknowns to differences of displacements (m d,), m."""
         return at_nodes(self._grid, unknowns, self._cell, self._values, self._other)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Add the resistance at u."""
+        """Add the penalty forces at u."""
         B = self._B(at.unknowns)
         w = B.createVecLeft()
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
@@ -140,7 +141,7 @@ class TieLoads(Loads):
         return out
 
     def coupling(self, at: At) -> PETSc.Mat:
-        """Return the derivative of the resistance."""
+        """Return the derivative of the penalty forces."""
         return self._coupling(at.unknowns)
 
     def _coupling(self, unknowns: Unknowns) -> PETSc.Mat:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid tools in contact with the bodies, and their motion."""
+"""Rigid tools in contact with the bodies: shape, strength of the contact, prescribed motion and loads."""
 
 from __future__ import annotations
 
@@ -37,82 +37,83 @@ class Pose(NamedTuple):
     shift: NDArray[np.float64]
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions x (m, d) in the frame of the tool."""
+        """Return positions x (m, d) in the frame of the tool, in which the tool is in its initial position."""
         y = x - self.shift
         return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the present positions of places y (m, d) in the frame of the tool."""
+        """Return the current positions of positions y (m, d) in the frame of the tool."""
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
-    def gone(self, way: NDArray[np.float64]) -> Pose:
-        """Return the pose after a displacement, m, which a rotation about the centre may follow, rad."""
+    def moved(self, by_forces: NDArray[np.float64]) -> Pose:
+        """Return the pose after a further displacement, m, and, if `by_forces` contains it, a rotation, rad."""
         d = len(self.R)
-        R = turned(way[d]) @ self.R if way[d:].any() else self.R
-        return Pose(R, self.centre, self.shift + way[:d])
+        R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
+        return Pose(R, self.centre, self.shift + by_forces[:d])
 
 
-def turned(angle: float) -> NDArray[np.float64]:
+def rotation(angle: float) -> NDArray[np.float64]:
     """Return the matrix (2, 2) of a rotation by an angle, rad."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def gone(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return the displacement of a tool by forces from an outcome, m, followed by a rotation by forces, rad."""
-    rotation = outcome.get("tool_rotation", {})
-    way = outcome["tool_travel"][name]
-    return np.append(way, rotation[name]) if name in rotation else way
+def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
+    """Return the displacement of a tool by forces, m, from an outcome, followed by its rotation by forces, rad."""
+    angle = outcome.get("tool_rotation", {})
+    by_forces = outcome["tool_travel"][name]
+    return np.append(by_forces, angle[name]) if name in angle else by_forces
 
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """Rigid body in contact with the surface of the bodies, anywhere on it.
+    """Rigid tool in contact with the surface of the bodies, at any position of the surface.
 
-    Bodies do not penetrate it, and may separate from it.  Sides in contact keep their hydraulic condition.  The
-    simulation's `tool_forces` are its forces and moments on the bodies.
+    Bodies cannot penetrate the tool, but may separate from it.  Sides in contact keep their hydraulic condition.
+    `tool_forces` of the simulation are the forces and moments of the tool on the bodies.
 
     Parameters
     ----------
     shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
-        The solid in its initial position; a function returns the signed distance, positive outside the tool.
+        The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Displacement from the initial position, also in later stages.  In axisymmetry along the axis, without rotation.
+        Displacement from the initial position, also in later stages.  In axisymmetry: along the axis.
     rotation_rad : float or callable t (s) -> float, rad
-        In 2D: counterclockwise rotation about `centre`, before the displacement.
+        Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
     centre : (d,), m
-        Centre of rotation and reference of moments, of a free tool its centre of mass.  It moves with the tool.  By
-        default the origin, of a free disc or polygon its centroid.
+        Centre of rotation, reference of moments, and centre of mass of a free tool.  It moves with the tool.  By
+        default the centroid of a free disc or polygon, else the origin.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0: alpha s_u for undrained soil, with friction 0.  It is
-        limited to ten times the normal pressure.
+        Additional shear strength of the contact, Pa, >= 0, at most ten times the normal pressure.  For undrained soil:
+        alpha s_u, with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
-        The tool moves along `direction`, beyond its displacement, until the reaction equals the load, from the first
-        step on.  The tool must begin in contact, or less than a cell away.  `tool_travel` of
-        the simulation is this additional displacement.  In axisymmetry the load of the whole revolution.
+        The tool moves along `direction`, in addition to its displacement, until the reaction equals the load, from the
+        first step on.  The tool must start in contact, or less than a cell away.  `tool_travel` of the simulation
+        is this additional displacement.  In axisymmetry: the load on the whole circumference.
     direction : (d,)
-        Direction of the load; of any length; in axisymmetry along the axis.
+        Direction of the load, of any length.  In axisymmetry: along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
-        move it from `displacement`, along `direction` if given, else in any direction.  Results are `tool_travel` (d,),
-        m, and the velocity `outcome("tool_velocity")` (d,), m/s.
+        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  It is at rest while
+        an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity `outcome("tool_velocity")`
+        (d,), m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
-        Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; in 2D.  By default that of
-        a uniform disc or polygon.  A tool with `direction` or of another shape then does not rotate (infinity).
-        Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+        Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
+        that of a uniform disc or polygon.  Without it, other shapes and tools with `direction` do not rotate.  Results
+        are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
-        Name of its results, and of its pressure on points, NAME_pressure; by default "tool".  A tool of the same name
-        in a later stage keeps this pressure.
+        Name of the results, and of the contact pressure on points, NAME_pressure; by default "tool".  A tool with the
+        same name in a later stage takes over this pressure.
 
     Raises
     ------
     ValueError
-        An invalid value.  From a step: the tool begins inside a body, or meets a side with prescribed displacement.
+        An invalid value.  From a step: the tool starts inside a body, or touches a side with prescribed displacement.
     """
 
     shape: Shape | Callable[[NDArray[np.float64]], ArrayLike]
@@ -150,7 +151,7 @@ class Tool:
             self.pushes(0.0)
 
     def _check_free(self) -> None:
-        """Raise an error for an invalid mass, and for arguments that depend on it."""
+        """Raise an error for an invalid mass, and for other invalid arguments of a free tool."""
         if self.mass is None:
             of_free = {"velocity": self.velocity is None, "moment": self.moment is None, "spin": self.spin == 0}
             for name in [name for name, absent in of_free.items() if not absent][:1]:
@@ -180,27 +181,27 @@ class Tool:
         return v
 
     def guide(self, dim: int) -> NDArray[np.float64]:
-        """Return the projection (d, d) on the directions in which a free tool may move."""
+        """Return the projection (d, d) onto the directions in which a free tool may move."""
         along = self.along(dim)
         return np.eye(dim) if self.direction is None else np.outer(along, along)
 
     def _uniform(self, dim: int) -> Uniform | None:
-        """Return a free disc or polygon as a uniform solid, None for other tools."""
+        """Return centroid and radius of gyration of a free disc or polygon; None for other tools."""
         return uniform(self.shape) if self.free and dim == 2 and isinstance(self.shape, (Ball, Convex)) else None
 
     def inertia(self, dim: int) -> float:
-        """Return the moment of inertia about the centre, kg m^2, infinity for a tool that does not rotate."""
+        """Return the moment of inertia about the centre, kg m^2; infinity for a tool that does not rotate."""
         if self.moment is not None:
             return float(self.moment)
         of = self._uniform(dim)
         return np.inf if of is None or self.direction is not None else self.mass * of.gyration
 
-    def turns(self, dim: int) -> bool:
+    def rotates(self, dim: int) -> bool:
         """Whether forces rotate the tool."""
         return self.free and np.isfinite(self.inertia(dim))
 
     def pushes(self, t: float) -> float:
-        """Return the load at time t (s), N; nan without a load."""
+        """Return the load at time t (s), N; nan if the tool has no load."""
         if self.load is None:
             return np.nan
         value = float(self._given("load", t))
@@ -209,11 +210,11 @@ class Tool:
         return value
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
-        """Return an attribute's value at time t (s): a number, or with a dimension also (d,)."""
+        """Return the value of an attribute at time t (s): a number, or a vector (d,) if `dim` is given."""
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the unit vector (d,) of the load, zero without."""
+        """Return the unit vector (d,) of the load; zero without a load direction."""
         if self.direction is None:
             return np.zeros(dim)
         along = unit_vector("Tool: direction", self.direction)
@@ -222,7 +223,7 @@ class Tool:
         return along
 
     def on(self, grid: Grid) -> Tool:
-        """Return the tool for positions relative to the grid's base."""
+        """Return the tool for positions relative to the base of the grid."""
         out, base = copy(self), grid.base
         if base.any():
             vars(out).update(_base=base, _moved=None if callable(self.shape) else self.shape.moved(-base))
@@ -234,17 +235,17 @@ class Tool:
         return self.friction > 0 or self.adhesion > 0
 
     def solid(self, h: float) -> Shape:
-        """Return the shape; h: cell size, m."""
+        """Return the shape; `h` is the cell size, m."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
-        """Raise an error for a tool of another dimension, or with an invalid initial motion."""
+        """Raise an error for a tool of the wrong dimension, or with an invalid initial motion."""
         of = dim if callable(self.shape) else self.shape.dim
         if of != dim:
             raise ValueError(f"{line(self)}: a shape in {of}D, must be in {dim}D as the grid")
         if dim == 3 and (callable(self.rotation_rad) or self.rotation_rad):
             raise ValueError(f"{line(self)}: rotation_rad, must be 0 in 3D")
-        for name in ("displacement", "rotation_rad"):  # values of functions are checked at their evaluation
+        for name in ("displacement", "rotation_rad"):  # values of functions are checked when they are used
             if not callable(getattr(self, name)):
                 self._given(name, 0.0, dim if name == "displacement" else 0)
         self._centre(dim)
@@ -253,13 +254,13 @@ class Tool:
         self._check_turns(dim)
 
     def _check_turns(self, dim: int) -> None:
-        """Raise an error for an invalid rotation of a free tool."""
-        of, turns = self._uniform(dim), self.turns(dim)
-        if dim == 3 and turns:
+        """Raise an error for invalid rotation of a free tool."""
+        of, rotates = self._uniform(dim), self.rotates(dim)
+        if dim == 3 and rotates:
             raise ValueError(f"{line(self)}: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")
-        if self.spin and not turns:
+        if self.spin and not rotates:
             raise ValueError(f"{line(self)}: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
-        if not turns:
+        if not rotates:
             return
         if self.centre is None and of is None:
             raise ValueError(f"{line(self)}: moment, must be given with the centre of this shape")
@@ -272,27 +273,27 @@ class Tool:
             return (np.zeros(dim) if of is None else of.centroid) - self._base
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
-    def pose(self, t: float, dim: int, way: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at time t (s) after an additional displacement by forces, m.
+    def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
+        """Return the pose at time t (s), after an additional displacement `by_forces`, m, caused by the applied load.
 
-        way: for a free tool a vector, followed by its rotation, rad.
+        For a free tool, `by_forces` is a vector, followed by the rotation, rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
         R, angle = np.eye(dim), float(self._given("rotation_rad", t))
         if angle:
-            R = turned(angle)
-        gone = way if np.ndim(way) else way * self.along(dim)
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).gone(gone)
+            R = rotation(angle)
+        shift_by_forces = by_forces if np.ndim(by_forces) else by_forces * self.along(dim)
+        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).moved(shift_by_forces)
 
-    def drawn(self, grid: Grid, t: float, way: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return the corners (m, 2^d, d), m, of the grid's cells inside the tool at time t (s), for pictures.
+    def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+        """Return the corners (m, 2^d, d), m, of the grid cells inside the tool at time t (s), for pictures.
 
-        way: displacement by forces, m, see `pose`.  Corners beyond the surface are projected onto it, so edges are
-        blunt by a fraction of a cell.
+        `by_forces` is the displacement by forces, m, see `pose`.  Corners outside the tool are projected onto its
+        surface, so edges are blunt by a fraction of a cell.
         """
-        pose = self.pose(t, grid.dim, way)
+        pose = self.pose(t, grid.dim, by_forces)
         solid = self.solid(grid.least)
         nodes = tuple(grid.shape + 1)
         y = pose.own(grid.base + grid.places(np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1)))
@@ -300,7 +301,7 @@ class Tool:
         cells = grid.corners(np.arange(np.prod(grid.shape)))
         used, at = np.unique(cells[inside[cells].any(axis=1)], return_inverse=True)
         y = y[used]
-        for _ in range(ONTO):  # several times, for edges between planes
+        for _ in range(ONTO):  # edges between planes need several projections
             gap = solid.distance(y)
             if (gap <= ROUNDED * grid.least).all():
                 break

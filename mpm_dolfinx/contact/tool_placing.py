@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Tools of a stage: their contact with the bodies in a step, and the contact history of points.
+"""Tools of a stage: their poses, the contact pairs in a step, and checks for penetration.
 
-The contact equations are in `problem`.
+`problem` has the contact equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import copy
 from typing import NamedTuple
 
@@ -20,83 +20,68 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.conditions import Displacement, resistance
+from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
+from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.conditions.sides import everywhere
-from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.free_tools import FreeTools
+from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
-from mpm_dolfinx.contact.problem import Pushes
-from mpm_dolfinx.contact.tool import Pose, Tool, turned
-from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
+from mpm_dolfinx.contact.tool import Pose, Tool, rotation
+from mpm_dolfinx.mechanics.given_displacements import held_faces
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # cells: allowed initial penetration into a body, and penetration of prescribed sides
+BEGINS = 1e-2  # cells: allowed penetration into a body at the start, and into prescribed sides
 NEAR = 0.1  # cells: corners within this distance follow the Q1 field
-STRIDE = 0.02  # cells: points may pass thinner tools in a step undetected
-LEFT = 1e-3  # cells: penetration left to corners, as a full projection would roughen the stress
-FACING = 0.5  # cosine between a face's normal and the direction to the tool above which it faces the tool
+STRIDE = 0.02  # cells: a tool thinner than this may pass through points in a step without notice
+LEFT = 1e-3  # cells: penetration that remains at corrected corners; a full projection would roughen the stress
+FACING = 0.5  # smallest cosine between the normal of a face and the direction to the tool, if the face faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return the corners (d,) of the bounding box of positions (m, d), and the reductions over processes."""
+    """Return both corners (d,) of the bounding box of positions (m, d), each with its reduction over processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
-def ways_of(dim: int) -> int:
-    """Return the number q of motions of a free tool: displacements, and in 2D a rotation."""
+def motion_count(dim: int) -> int:
+    """Return the number q of motions of a free tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
 
 
-class Ways(NamedTuple):
-    """Displacements of tools by loads (k,), m, at the start and the end of a step, with both times, s.
+class LoadMotion(NamedTuple):
+    """Displacements of tools by loads, m, at the start and end of a step; with free tools (k, q), with rotations."""
 
-    With free tools (k, q): displacements and rotations.
-    """
-
-    start: float
-    end: float
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
+    start: float  # start of the step, s
+    end: float  # end of the step, s
+    before: NDArray[np.float64]  # displacements at the start (k,), m
+    after: NDArray[np.float64]  # displacements at the end (k,), m
 
     def at(self, t: float) -> NDArray[np.float64]:
-        """Return the displacements at a time in the step (s)."""
+        """Return the displacements at time t in the step (s), by linear interpolation."""
         share = (t - self.start) / (self.end - self.start) if self.end > self.start else 1.0
         return self.before + share * (self.after - self.before)
 
 
-class Tools:
-    """The tools of a stage.
+class Tools(Touching):
+    """The tools of a stage, with their motion in a step.
 
     Parameters
     ----------
-    grid, materials
-        Background grid, and the materials of the scene.
-    tools
-        Tools by name.
-    outside
-        Surface of the bodies.
-    held
-        Prescribed displacements with their faces, which tools do not touch.
+    setting, tools
+        Data of the stage, and its tools by name.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        materials: SceneMaterials,
-        tools: Mapping[str, Tool],
-        outside: Surface,
-        held: Sequence[tuple[Displacement, Surface]],
-    ):
-        self.grid = grid
-        self._materials = materials
-        self._held = held
-        self.names, self.tools = tuple(tools), tuple(tools.values())
+    conditions, title = (Tool,), "tools"
+
+    def __init__(self, setting: Setting, tools: Mapping[str, Tool]):
+        super().__init__(setting, tools)
+        grid, self.tools = setting.grid, tuple(tools.values())
+        self._held = [(hold, faces) for hold, faces, _ in held_faces(setting)]
+        """Prescribed displacements with their faces.  Tools must not touch these faces."""
         still = np.zeros(len(self.tools))
-        self._ways, self._end = Ways(0.0, 0.0, still, still), None
+        self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
             raise ValueError("tools: one is given twice, must be distinct")
         for tool in self.tools:
@@ -110,15 +95,10 @@ class Tools:
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
-        self.faces, sides = outside, 2 * grid.dim
-        taken = [faces.id * sides + faces.face for _, faces in held]
-        own = self.faces.id * sides + self.faces.face
-        self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *taken]))
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the tangent is symmetric."""
-        return not any(tool.grips for tool in self.tools)
+        self.outside, sides = setting.sides.all(), 2 * grid.dim
+        held = [faces.id * sides + faces.face for _, faces in self._held]
+        own = self.outside.id * sides + self.outside.face
+        self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *held]))
 
     @property
     def free(self) -> bool:
@@ -127,19 +107,19 @@ class Tools:
 
     @property
     def masses(self) -> NDArray[np.float64]:
-        """Masses (tools, q), kg, and moments of inertia, kg m^2, of free tools; 0 for others."""
+        """Masses, kg, and moments of inertia, kg m^2, of free tools (tools, q); 0 for other tools."""
         d = self.grid.dim
-        out = np.array([np.full(ways_of(d), tool.mass or 0.0) for tool in self.tools])
+        out = np.array([np.full(motion_count(d), tool.mass or 0.0) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
-            if tool.turns(d):
+            if tool.rotates(d):
                 row[d:] = tool.inertia(d)
         return out
 
     @property
     def guides(self) -> NDArray[np.float64]:
-        """Projections (tools, q, q) on the motions of free tools, in axisymmetry along the axis."""
+        """Projections (tools, q, q) onto the possible motions of free tools; in axisymmetry along the axis."""
         d = self.grid.dim
-        out = np.zeros((len(self.tools), ways_of(d), ways_of(d)))
+        out = np.zeros((len(self.tools), motion_count(d), motion_count(d)))
         out[:, d:, d:] = np.reshape(self.turning, (-1, 1, 1))
         for one, tool in zip(out, self.tools, strict=True):
             one[:d, :d] = tool.guide(d) * tool.free * (np.arange(d) >= self.grid.axisymmetric)[:, None]
@@ -147,20 +127,20 @@ class Tools:
 
     @property
     def turning(self) -> list[bool]:
-        """Which free tools rotate."""
-        return [tool.turns(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
+        """Whether each tool is free and rotates."""
+        return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
 
     def pushes(self, t: float) -> NDArray[np.float64]:
-        """Return the loads (tools, q), N, on free tools at time t (s), and no torques."""
+        """Return the loads (tools, q), N, on free tools at time t (s); torques are zero."""
         d = self.grid.dim
-        out = np.zeros((len(self.tools), ways_of(d)))
+        out = np.zeros((len(self.tools), motion_count(d)))
         out[:, :d] = [np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools]
         return out
 
-    def going(self, ways: Ways, end: float | None = None) -> Tools:
-        """Return the tools with their displacements by loads in a step; end: end of a step with inertia, s."""
+    def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
+        """Return the tools with their displacements by loads in a step.  `end` is the end of a step with inertia, s."""
         tools = copy(self)
-        tools._ways, tools._end = ways, end
+        tools.by_loads, tools._end = by_loads, end
         return tools
 
     def pose(self, number: int, t: float) -> Pose:
@@ -168,9 +148,9 @@ class Tools:
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at the end of a substep, t (s), which with inertia gives its velocity.
+        """Return the pose of a tool at time t (s), the end of a substep.
 
-        See `in_step`.
+        With inertia, a first substep needs the displacement that gives the exact velocity, see `in_step`.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -180,33 +160,67 @@ class Tools:
         shift = in_step(share, before.shift, pose.shift, end.shift)
         if not (end.R != before.R).any():
             return pose._replace(shift=shift)
-        turns = [of.R @ before.R.T for of in (pose, end)]
-        angle = in_step(share, 0.0, *(np.arctan2(turn[1, 0], turn[0, 0]) for turn in turns))
-        return pose._replace(shift=shift, R=turned(angle) @ before.R)
+        rotations = [of.R @ before.R.T for of in (pose, end)]
+        angle = in_step(share, 0.0, *(np.arctan2(turn[1, 0], turn[0, 0]) for turn in rotations))
+        return pose._replace(shift=shift, R=rotation(angle) @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
-        """Return the pose of a tool at time t (s); ValueError for invalid motion in axisymmetry."""
-        pose = tool.pose(t, self.grid.dim, self._ways.at(t)[self.tools.index(tool)])
+        """Return the pose of a tool at time t (s); raise ValueError for motions that axisymmetry excludes."""
+        pose = tool.pose(t, self.grid.dim, self.by_loads.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
-            what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
+            what = f"moves by {pose.shift}{' and rotates' * bool(pose.R[0, 1])} at t = {t:g} s"
             raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
         return pose
 
-    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero contact histories of n points."""
-        return kept(dict(zip(self.names, self.tools, strict=True)), n, self.grid.dim)
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return forces and moments filled with this value, displacements by loads of zero, and initial velocities."""
+        out, d = super().unknown(value), self.grid.dim
+        tools = dict(zip(self.names, self.tools, strict=True))
+        out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
+        if self.free:
+            out["tool_velocity"] = {name: tool.begins(d) for name, tool in tools.items() if tool.free}
+        turning = dict(zip(self.names, self.turning, strict=True))
+        if any(turning.values()):
+            out["tool_rotation"] = {name: np.array(0.0) for name, rotates in turning.items() if rotates}
+            out["tool_spin"] = {name: np.array(float(tools[name].spin)) for name, rotates in turning.items() if rotates}
+        return out
 
-    def placed(
-        self, cut: CutDomains, points: MaterialPoints, start: float, t: float
-    ) -> tuple[ContactLaw, Origin, Pushes]:
-        """Return the contact at time t (s) of a step that began at `start`, with the present points."""
+    def _before(self, place: Place) -> NDArray[np.float64]:
+        """Return displacements by loads (tools,), m, before a step; with free tools (tools, q), with rotations, rad."""
+        if self.free:
+            return self._of_free(place.before, "tool_travel", "tool_rotation")
+        return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
+
+    def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
+        """Return the displacements and rotations (tools, q), or the velocities; zero for tools that are not free."""
+        d = self.grid.dim
+        out = np.zeros((len(self.names), motion_count(d)))
+        for row, name in zip(out, self.names, strict=True):
+            row[:d] = before[along].get(name, 0.0)
+            row[d:] = before.get(around, {}).get(name, 0.0)
+        return out
+
+    def placed(self, place: Place) -> Loads:
+        """Return the loads by contact with tools in a substep; without inertia free tools keep their position."""
+        before = self._before(place)
+        tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
+        if not (self.free and place.inertia):  # an initial stress is balanced without inertia
+            return ToolLoads(tools, place)
+        velocity = self._of_free(place.before, "tool_velocity", "tool_spin")
+        options = {"velocity": velocity, "pushes": self.pushes(place.t)}
+        return FreeToolLoads(tools, place, mass=self.masses, guides=self.guides, **options)
+
+    def contact(self, place: Place) -> tuple[ContactLaw, Origin, Pushes]:
+        """Return the contact law in a substep, the material points of its pairs, and the loads of tools."""
+        cut, points = place.cut, place.points
+        start, t = place.start, place.t
         grid, d = self.grid, self.grid.dim
-        patches = cut.surface(self.faces)
+        patches = cut.surface(self.outside)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
-        resists = self._materials.table(cut.points, resistance)[patches.at]
+        resistances = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
-        # loads do not act on the initial stress
+        # the initial stress is balanced without loads on tools
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
@@ -216,48 +230,48 @@ class Tools:
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
-            scalars = [np.full(len(at), number), size[at], resists[at], pressure]
+            scalars = [np.full(len(at), number), size[at], resistances[at], pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
-        travel = Exchange(grid.comm, grid.owner(patches.cell[at]))
-        cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
+        cell, place, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         acts = np.ones(len(self.tools)), self.tools, poses
         pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
-        origin = Origin(travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
+        origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
-        pushes = Pushes([line(tool) for tool in self.tools], self._ways.before, along, np.array(loads))
+        pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
         return ContactLaw(self.names, self.tools, pairs), origin, pushes
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which places that face a tool lie within half a cell of its edge, where the body continues.
+        """Return which positions that face a tool lie within half a cell of the tool's edge, where the body continues.
 
-        The last loaded node carries half a cell beyond it, so there is no contact on this margin.  A tool narrower than
-        a cell keeps its whole contact.
+        The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
+        than a cell keeps its whole contact.
 
         Parameters
         ----------
         x, unit : (m, d), m, -
             Positions on the surface of the bodies, and outward normals.
         faces : (m,)
-            Which of them face the tool.
+            Which of these positions face the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
         edge = np.zeros(len(y), dtype=bool)
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
-                beside = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = everywhere(grid, lambda beside=beside: tool.solid(grid.least).normal(beside) @ pose.R.T)
+                shifted = pose.own(y + half * (e - n[:, [axis]] * n))
+                to = everywhere(grid, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
 
         def cells(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return positions in cells."""
+            """Return positions, measured in cells."""
             return x / grid.h if grid.even else grid.in_cells(x)
 
         low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
@@ -272,60 +286,61 @@ class Tools:
         edge[edge] = goes_on
         return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
 
-    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Raise an error for tools inside a body at time t (s), except at faces with contact from earlier steps."""
-        patches = cut.surface(self.faces)
+    def check_start(self, place: Place) -> None:
+        """Raise an error for tools inside a body at the start, except at faces in contact from earlier steps."""
+        before, t = self._before(place), place.start
+        points = place.points
+        tools, patches = self.going(LoadMotion(t, t, before, before)), place.cut.surface(self.outside)
         x = patches.now(points)
         for number, tool in enumerate(self.tools):
-            met = points.data[pressure_name(self.names[number])] > 0
-            deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
+            loaded = points.data[pressure_name(self.names[number])] > 0
+            deep, where = tools._deepest(tool, np.concatenate([x[~loaded[patches.at]], points.x]), t)
             if deep > BEGINS:
                 what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
-    def check_end(
-        self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
-    ) -> None:
-        """Raise an error if tools contain points, touch prescribed sides, or have passed through points in a step.
+    def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Raise an error if a tool contains points, touches prescribed sides, or has passed through a body in a step.
 
-        before: points at the start of the step, time `start` (s).
+        `before` are the points at the start of the step.
         """
+        t = place.t
         for tool in self.tools:
             for hold, faces in self._held:
-                deep, where = self._deepest(tool, cut.surface(faces).now(points), t)
+                deep, where = self._deepest(tool, place.cut.surface(faces).now(points), t)
                 if deep > BEGINS:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
             deep, where = self._deepest(tool, points.x, t)
-            held, there = self._deepest(tool, middle(corners), t)
-            if deep > NEAR or held > 0:  # in a round tool, stretched domains have their middles, not their corners
-                where = where if deep > NEAR else there
+            held, at_middle = self._deepest(tool, middle(corners), t)
+            if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
+                where = where if deep > NEAR else at_middle
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
-            if where := self._passed(tool, (before.x, points.x), (start, t)):
+            if where := self._passed(tool, (before.x, points.x), (place.start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
         """Return which corners (n, 2^d, d) of domains touch tools at time t (s), and follow the Q1 field alone.
 
-        The tool would reverse any further motion of these corners in the next step, and pressures would oscillate.
+        The tool would reverse any other motion of these corners in the next step, and pressures would oscillate.
         """
         out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.least
         for tool in self.tools:
             out |= self._gaps(tool, corners, t) < NEAR * h
         return out
 
-    def outside(
-        self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float = NEAR
+    def pushed_out(
+        self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return corners of domains, where small penetrations of tools are reduced to `LEFT`.
+        """Return corners of domains after a correction that reduces small penetrations of tools to `LEFT`.
 
-        Tools constrain means over cells, so corners of sliding domains would remain inside them.
+        Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
 
         Parameters
         ----------
         corners : (n, 2^d, d), m
-            The corners.
+            Corners of the domains.
         t
             Time, s.
         free : (n, 2^d, d)
@@ -344,44 +359,107 @@ class Tools:
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-        """Return distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
+        """Return the distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
         gap = everywhere(self.grid, lambda: tool.solid(self.grid.least).distance(own))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return one of the positions x (n, d) that pass straight through a tool between two times (s), or "".
+        """Return a position x (n, d) whose path between two times (s) crosses a tool, or "" if there is none.
 
-        The search advances by the distance to the tool (sphere tracing: Hart 1996).
+        The paths are straight.  The search proceeds by the distance to the tool (sphere tracing: Hart 1996).
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
-        way = np.linalg.norm(end - y, axis=1)
-        gone = np.zeros(len(y))
+        length = np.linalg.norm(end - y, axis=1)
+        done = np.zeros(len(y))
         on = np.arange(len(y))
-        along = (end - y) / np.maximum(way, TINY)[:, None]
+        along = (end - y) / np.maximum(length, TINY)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
-        turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle that leaves the tool on its other side
-        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned + self.grid.base)):
+        crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # the middle lies in the tool and changes the side
+        if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
-            at = y[on] + gone[on, None] * along[on]
+            at = y[on] + done[on, None] * along[on]
             gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
-            inside = x[1][on[gap < -LEFT * h]][:1]  # middles of thin domains slide along round tools
+            inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
-            gone[on] += np.maximum(gap, STRIDE * h)
-            on = on[gone[on] < way[on]]
+            done[on] += np.maximum(gap, STRIDE * h)
+            on = on[done[on] < length[on]]
         return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
-        """Return the largest penetration of positions x (m, d) into a tool, in cells, and its place."""
+        """Return the largest penetration of positions x (m, d) into a tool, in cells, and the position as text."""
         h, pose = self.grid.least, self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
-        here = (
+        place = (
             np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
         )
-        return -deepest / h, first(self.grid.comm, here)
+        return -deepest / h, first(self.grid.comm, place)
+
+
+class ToolLoads(ContactProblem):
+    """Loads by contact with tools in a substep.
+
+    Parameters
+    ----------
+    tools, place
+        Tools with their motion in the step, and positions and times of the substep.
+    """
+
+    def __init__(self, tools: Tools, place: Place):
+        super().__init__(*tools.contact(place))
+        self._tools, self._place = tools, place
+        self.shares, self._earlier = Shares(np.inf, 0.0, None), None
+
+    def begun(self, shares: Shares, earlier: SubstepMotion | None) -> ToolLoads:
+        """See `Loads`."""
+        out = copy(self)
+        out.shares, out._earlier = shares, earlier
+        return out
+
+    def flown(self, at: At) -> SubstepMotion:
+        """See `Loads`."""
+        return SubstepMotion(self.shares.own, self.pairs.poses)
+
+    def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
+        """See `ContactProblem`.  The time integration finds the velocity from tool positions in both substeps."""
+        pairs = self.pairs
+        moved = pairs.carried - pairs.now
+        if self._earlier is not None:
+            before = np.zeros_like(moved)
+            for number, pose in enumerate(self._earlier.poses):
+                on = pairs.number == number
+                start = self._tools.pose(number, self._place.start)
+                before[on] = pose.put(start.own(pairs.now[on])) - pairs.now[on]
+            moved = moved - self.shares.before / self._earlier.own * before
+        return moved / self.shares.own
+
+    def ended(self, at: At) -> Loads:
+        """Return the loads by contact with the tools at their final positions."""
+        out = copy(self)
+        by_loads = self._tools.by_loads
+        out._tools = self._tools.going(by_loads._replace(after=by_loads.before + self.found(at).motion))
+        return out
+
+    def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
+        """Return which corners touch tools."""
+        return self._tools.near(corners, self._place.t)
+
+    def outside(
+        self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
+    ) -> NDArray[np.float64]:
+        """Return the corners, moved out of the tools that they slightly penetrate."""
+        return self._tools.pushed_out(corners, self._place.t, free, np.inf if everywhere else NEAR)
+
+    def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Raise an error if a tool has passed through a body, or lies inside one."""
+        self._tools.check_end(self._place, points, before)
+
+
+class FreeToolLoads(FreeTools, ToolLoads):
+    """Loads by contact with tools, among them free tools."""

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.active import ActiveSet
 
 
 def check_held(
-    grid: Grid,
     active: ActiveSet,
     free: NDArray[np.bool_],
     holds: Sequence[tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]],
@@ -42,9 +40,10 @@ def check_held(
     ValueError
         With the place of the part and its number of free rigid-body modes.
     """
+    grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)
     cells = active.cells
-    centre, size = _extents(grid, cells, part[cells] - 1, count)
+    centre, size = _extents(active, part[cells] - 1, count)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
     row, axis = np.nonzero(~free[nodes])
     x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
@@ -72,7 +71,7 @@ def check_held(
         ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         reached[1:] = missing == 0
-        if (missing == before).all():
+        if reached.all() or (missing == before).all():
             break
     for k in range(1, count + 1):
         if missing[k - 1]:
@@ -87,12 +86,12 @@ def check_held(
             )
 
 
-def _extents(
-    grid: Grid, cells: NDArray[np.int64], part: NDArray[np.int64], count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extents(active: ActiveSet, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of parts."""
+    grid = active.grid
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):
-        np.minimum.at(ends, part, sign * grid.midpoints[cells])
+        for k in range(count):
+            ends[k] = (sign * grid.midpoints[active.cells[part == k]]).min(axis=0, initial=np.inf)
         grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
     return (low - high) / 2, (-high - low + (grid.h if grid.even else grid.most)).max(axis=1)

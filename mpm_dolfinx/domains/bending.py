@@ -2,15 +2,16 @@
 """Displacement of the corners of particle domains: the Q1 field of the grid with a quadratic correction.
 
 In bending the true strain varies linearly over a cell, but the strain of a Q1 field jumps at the grid lines.  Particle
-domains that follow the Q1 field take on a sawtooth strain.  On the way back other grid lines cross the body, and the
-sawtooth remains as stress.  The corners therefore follow the field with its second differences along each axis,
+domains that follow the Q1 field acquire a sawtooth strain.  When the motion reverses, other grid lines cross the body,
+and the sawtooth remains as stress.  The corners therefore follow the field with second differences along each axis,
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
 with the position t_a in [0, 1] in the cell.  This field is exact for quadratic displacements, equal to Q1 at the nodes,
-and continuous.  D_a is a second difference along the cell edge that ends at node i.  Each end of the edge has one; the
-smaller one counts, or zero if their signs differ.  If only one end has a second difference, this one counts.  With
-cells of several sizes D_a is edge^2 times the divided difference.  Physical kinks, as between materials, are kept.
+and continuous.  D_a is a second difference along the cell edge that ends at node i.  Of the second differences at both
+ends of the edge, D_a is the smaller one, or zero if their signs differ.  If only one end has a second difference, D_a
+is this one.  With cells of several sizes D_a is edge^2 times the divided difference.  Physical kinks, for example at
+the boundary of two materials, are kept.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ from mpm_dolfinx.points.cutting import corner_bits
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return (2, m, d), m: the Q1 displacement of the corners, and its quadratic correction.
+    """Return two fields (2, m, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     Parameters
     ----------
     cells, x : (m,), (m, d), m
-        Owned cells with the corners, and positions of the corners.
+        Owned cells that contain the corners, and positions of the corners.
     u : (nodes, d), m
         Nodal displacements.
     filled : (cells,)
-        Which local cells contain material.  Nodes beyond an empty cell may belong to another body.
+        Whether local cells contain material.  A node beyond an empty cell may belong to another body.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
@@ -42,7 +43,7 @@ def followed(
     field = grid.over_edges(grid.monomials @ _at(u, grid.cell_nodes[used]), used)
     bends = _second_differences(grid, used, u, filled)
     out = np.empty((2, *x.shape))
-    # corners are the last axis: numpy takes six times as long for rows of a few numbers each
+    # the last axis is the corner: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
         slots, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
         out[0, part] = _polynomial(field, y, slots).T
@@ -53,16 +54,17 @@ def followed(
 
 
 def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return nodal values (nodes, d) at nodes (n, k), as (d, k, n)."""
+    """Return nodal values (nodes, d) at nodes (n, k), as an array (d, k, n)."""
     return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
 
 
 def _polynomial(
     coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
 ) -> NDArray[np.float64]:
-    """Return a multilinear vector field (d, m) at offsets y (d, m), m, from the midpoints of cells.
+    """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
 
-    coefficients (d, k, cells): factors of the monomials, ordered as in `Grid.monomials`, without axis `without`.
+    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) are the
+    cells.  The field does not depend on the axis `without`.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -78,14 +80,14 @@ def _polynomial(
 def _second_differences(
     grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
-    """Return the second differences along the edges of owned cells, m, for each axis.
+    """Return the second differences, m, along the edges of owned cells, for each axis.
 
-    They are polynomials of the other coordinates: coefficients (d, 2^(d-1), cells) for `_polynomial`.
+    Each is a polynomial of the other coordinates, with coefficients (d, 2^(d-1), cells) as in `_polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
     out = []
-    order = np.lexsort(grid.signs.T)  # of the nodes, to match `bits`
+    order = np.lexsort(grid.signs.T)  # order of the nodes that matches `bits`
     nodes, neighbours = grid.cell_nodes[cells], grid.neighbours(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
@@ -105,9 +107,9 @@ def _second_differences(
         first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
         bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
-        across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # equal at both ends
+        across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # the same at both ends
         bend = (across[:, low] + across[:, high]) @ bend
-        if not grid.even:  # for offsets in m
+        if not grid.even:  # converts to offsets in m
             rows = (np.arange(2**d) >> a & 1 == 0).nonzero()[0]
             whole = np.zeros((d, 2**d, len(cells)))
             whole[:, rows] = bend

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Particle domains cut by the grid of a step: their pieces, owners of the cells, transfer of values."""
+"""Particle domains cut by the grid: their pieces, owners of the cells, and transfer of values between processes."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, in cells, since the domains were cut; with larger motion they are cut again.
+"""Largest motion of corners, in cells, for which a cut remains valid.  After larger motion the domains are cut again.
 
-The reference is a cut in every step.  In a consolidating column of ten cells the pressures change by 7e-5 of the load,
-and the settlement by 3e-5 of itself.  Both errors are proportional to this number.
+The reference is a new cut in every step.  In a consolidating column of ten cells, STILL changes pressures by 7e-5 of
+the load, and the settlement by 3e-5 of its value.  Both errors are proportional to STILL.
 """
 
 
 class Patches:
-    """Quadrature points on faces of particle domains; arrays over n of them.
+    """Quadrature points on faces of particle domains; arrays over n points.
 
     Parameters
     ----------
     grid
         Background grid.
     faces
-        Faces of the surface.
+        Faces on the surface of the bodies.
     face, at : (n,)
         Index of the face in `faces`, and index of the material point.
     cell : (n,)
-        Lexicographic cell.
+        Lexicographic number of the cell.
     x, xi : (n, d), m, -
-        Position at the last cut, and coordinates in the domain.
+        Position at the last cut, and local coordinates in the domain.
     share : (n,)
-        Fraction of the face.
+        Fraction of the face that the point represents.
     """
 
     def __init__(self, grid: Grid, faces: Surface, face, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
@@ -63,7 +63,7 @@ class Patches:
             area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
         self._share0 = share * area0
         self.base = grid.base
-        """Origin of positions, see `Grid`."""
+        """Origin of positions (d,), m, see `Grid`."""
         around = grid.around(interpolate(faces.domain[face], xi)) if grid.axisymmetric else 1.0
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
@@ -79,11 +79,11 @@ class Patches:
         return interpolate(points.origin[self.at], self.xi)
 
     def now(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the present positions (n, d), m."""
+        """Return the current positions (n, d), m."""
         return interpolate(points.corners[self.at], self.xi)
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the outward area vectors (n, d), m^(d-1)."""
+        """Return the current outward area vectors (n, d), m^(d-1)."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
@@ -93,53 +93,57 @@ class Patches:
 class CutDomains(Keyed):
     """Particle domains cut by the cells, and the exchange of their data with the owners of the cells.
 
-    The cut is valid until the points have moved.  The grid sees the positions at the time of the cut.
+    The cut is valid until the points have moved by more than `STILL`.  Until then, shape functions are evaluated at the
+    positions at the time of the cut.
 
     Parameters
     ----------
     grid
         Background grid.
     points
-        The material points of this process, in the grid.
+        Material points of this process; they must be inside the grid.
     domains
-        Whether to use exact pieces of the particle domains; otherwise one piece a point, as in standard MPM.
-    second
-        Whether to compute second moments of the pieces.
+        Whether to integrate over the exact pieces of the domains.  If not, each point is one piece, as in standard MPM.
+    second, faces
+        Whether to compute second moments and face areas of the pieces.
     """
 
-    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False):
+    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False, faces: bool = True):
         self.grid = grid
         self.points = points
         self.domains = domains
         self._patches: dict[Surface, Patches] = {}
-        self.pieces = cut(grid, points.corners, second) if domains else whole_points(grid, points.x)
+        self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
         self._exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._exchange.send(self.pieces.cell)), self._exchange.send(self.pieces.x)
-        """Owned cells, and centroids (m, d), m, of the pieces in them."""
+        """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
         self.mixed = self._exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
-        """Mean products of offsets of the pieces in 3D, see `Pieces`."""
+        """In 3D: mean products of the offsets of the pieces, see `Pieces`."""
         self.second = self._exchange.send(self.pieces.second) if second else None
-        """Mean products of all offsets of the pieces (m, d, d), m^2, if `second`."""
+        """If `second`: mean products of all offsets of the pieces (m, d, d), m^2."""
         self.hoop = self._exchange.send(self.pieces.hoop) if grid.axisymmetric else None
-        """Moments of the pieces in the plane (m, 4) in axisymmetry, see `Pieces`."""
+        """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return the largest motion of corners since the cut, in cells, for each of `count` parts (count,).
+        """Return the largest motion of corners since the cut, in cells, for each connected part (count,).
 
-        part (n,): number of the part of each point.
+        `part` (n,) is the number of the part to which each point belongs.
         """
-        largest = np.zeros(count)
-        np.maximum.at(largest, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
+        far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
+        largest = np.full(count, far.max(initial=0.0))
+        if count > 1:
+            largest[:] = 0.0
+            np.maximum.at(largest, part, far)
         return over_all(self.grid.comm, largest, MPI.MAX)
 
     def valid(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-        """Return for which parts (count,), see `moved`, the cut is still valid: motion up to `STILL`."""
+        """Return whether the cut is still valid for each connected part (count,), see `moved` and `STILL`."""
         return self.moved(points, part, count) <= STILL
 
     def to_cells(self, values: NDArray) -> NDArray:
-        """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
+        """Send values of the points (n, ...) to the owners of their pieces' cells; return values (m, ...)."""
         return self._exchange.send(values[self.pieces.point])
 
     def pieces_to_cells(self, values: NDArray) -> NDArray:
@@ -147,26 +151,26 @@ class CutDomains(Keyed):
         return self._exchange.send(values)
 
     def to_pieces(self, values: NDArray) -> NDArray:
-        """Bring values at the integrated pieces back to the pieces of this process's points."""
+        """Send values (m, ...) from the owners of cells back to the processes of the points, one for each piece."""
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
 
-        volume (m,): volumes of the pieces, m^d.
+        `volume` (m,) are the volumes of the pieces, m^d.
         """
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the volume means (n, ...) over the pieces of each point of values (m, ...) on the pieces."""
+        """Return for each point the volume mean (n, ...) of values (m, ...) of its pieces."""
         columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
         means = [sum_by(self.pieces.point, self.pieces.fraction * column, len(self.points)) for column in columns]
         return np.stack(means, axis=1).reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return means like `mean` of values at centroids in the plane; in axisymmetry weighted by area."""
+        """Return means as in `mean` for values at centroids in the plane; in axisymmetry weighted by area."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
@@ -176,13 +180,13 @@ class CutDomains(Keyed):
     def surface(self, faces: Surface) -> Patches:
         """Return quadrature points on the faces of a surface that belong to points of this process.
 
-        Their cell contains the position just under the surface, and a piece of the domain.  Its shape functions are
-        extended to the surface.  They apply the load to nodes with stiffness.
+        The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Shape
+        functions of this cell are extended to the surface, so that loads act on nodes with stiffness.
         """
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the quadrature points of several surfaces; one cut of all takes the time of one surface."""
+        """Return the quadrature points of several surfaces.  One cut of all surfaces takes the time of one surface."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -202,7 +206,7 @@ class CutDomains(Keyed):
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
         outward = face_vectors(corners, number)
         size = np.linalg.norm(outward, axis=1, keepdims=True)
-        skew = skew[here][face].nonzero()[0]  # xi is linear over a triangle, and places are not in xi
+        skew = skew[here][face].nonzero()[0]  # places are linear over a triangle, but not in xi
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
         inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
@@ -217,21 +221,21 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 field u (nodes, d) at the points (n, d), for points without domains."""
+        """Return the Q1 field u (nodes, d) at the points (n, d), for points that are not integrated over domains."""
         exchange, cells, x = self._followed
         return exchange.back(self.grid.at(cells, x, u))
 
     def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
-        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction there, m.
+        """Yield the Q1 field u (nodes, d), m, at the corners (n, 2^d, d), then its quadratic correction there, m.
 
-        filled (cells,): which local cells contain material.
+        `filled` (cells,) tells which local cells contain material.
         """
         exchange, cells, x = self._followed
         return (exchange.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with the cells' owners, cells of corners or points, and positions, m."""
+        """Exchange with the owners of cells, and their cells and positions (m, d), m, for corners or points."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim
@@ -243,10 +247,10 @@ class CutDomains(Keyed):
         return exchange, grid.local(exchange.send(cell)), exchange.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, of the pieces' centroids, from the corners of their domains."""
+        """Return the total displacements (m, d), m, of the pieces' centroids, from the corners of the domains."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
-        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
+        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # affine fit to the corners
         off = pieces.x - middle(points.corners)[pieces.point]
         off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
@@ -256,7 +260,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) of positions in domains; where a domain has no piece, the cell of its largest piece."""
+        """Return the cells (m,) of positions in domains; without a piece there, the cell of the largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
@@ -275,7 +279,7 @@ class CutDomains(Keyed):
 
 
 def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
-    """Return one piece a point, at the point; all faces of a cell with points are open."""
+    """Return one piece for each point, at the point.  All faces of a cell that contains points are open."""
     n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     h = grid.sizes_of(number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of particle domains and volume ratios of cells from corners, independent of their path."""
+"""Deformation gradients of particle domains and volume ratios of cells from corner positions, for any path."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determi
 def gradient(
     corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
 ) -> NDArray[np.float64]:
-    """Return the mean deformation gradient (n, d, d) of particle domains, over the simplices of the cut.
+    """Return the mean deformation gradient (n, d, d) of particle domains, over the simplices into which they are cut.
 
-    In axisymmetry (n, 3, 3).  The circumferential stretch follows the radius of the centroid, so det F is the ratio of
-    the ring volumes.  In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled to the
-    ratio of the volumes.  For a twisted hexahedron the mean gradient misses this ratio by a second-order term.
+    In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled to the ratio of the
+    volumes.  (For a twisted hexahedron the unscaled mean differs from this ratio by a second-order term.)  In
+    axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the centroid radii, and det F is
+    the ratio of the ring volumes.
 
     Parameters
     ----------
     corners, reference : (n, 2^d, d), m
-        Corners now, and at rest.
+        Current corners, and reference corners.
     """
     if corners.shape[2] == 2:
-        dx, dX = (y[:, [3, 2]] - y[:, [0, 1]] for y in (corners, reference))
-        F = np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        dx, dX = (y[:, :1:-1] - y[:, :2] for y in (corners, reference))  # the diagonals
+        F = dx.swapaxes(1, 2) @ cofactor(dX) / determinant(dX)[:, None, None]
         if not axisymmetric:
             return F
         out = np.zeros((len(F), 3, 3))
@@ -43,9 +44,9 @@ def gradient(
 def _of_hexahedra(
     corners: NDArray[np.float64], reference: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean F (n, 3, 3) over the simplices, and the volumes at rest (n,), m^3.
+    """Return the mean F (n, 3, 3) over the simplices, and the reference volumes V (n,), m^3.
 
-    F is the sum over corners of x_k and dV/dX_k, over V.  Arrays have the points last.
+    F is the sum over the corners k of x_k times dV/dX_k, divided by V.  The last axis of the arrays is the point.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = _slopes(X)
@@ -91,22 +92,23 @@ def volume_slopes(
 def cell_ratios(
     cut: CutDomains, points: MaterialPoints, share: NDArray[np.float64], flows: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the volume ratios (m,) of the cut's pieces at the start of a step.
+    """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With mean dilatation the ratio of a cell is the volume of its domains by their corners over the volume at rest.
-    It is independent of the path, and its variation within the cell does no work.  Ratios updated by increments alone
-    would drift from the volumes of the domains without a restoring force.  Other pieces have the ratio of their point.
-    So do cells with yielded soil, because corner volumes are meaningless near plastic flow.
+    With mean dilatation, the ratio of a cell is the current volume of its domains, from their corners, divided by the
+    reference volume.  This ratio depends on no path, and its variation within the cell does no work.  Ratios that are
+    updated only by increments would drift from the domain volumes, since no force would oppose the drift.  Without
+    mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
+    volumes are meaningless near plastic flow.
 
     Parameters
     ----------
     cut, points
-        Cut particle domains, and the points now.
+        Cut particle domains, and points at the start of the step.
     share : (n,)
-        Weight of the corners' ratio in the logarithm, in [0, 1]; the rest is the point's ratio.  0 without mean
+        Exponent of the ratio from corners in a geometric mean with the ratio of the point, in [0, 1]; 0 without mean
         dilatation.
     flows : (n,)
-        Which points have yielded.
+        Whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Deformation gradients that vary linearly within the particle domains of elastic soil.
 
-The gradient of a domain is a mean.  In bending the gradient varies across the domain.  With one value per domain the
-bending stiffness is too small by 1/n^2 with n domains over the thickness.  At a piece of the domain
+The gradient F of a domain is a mean.  In bending the gradient varies across the domain.  With one value per domain, and
+n domains over the thickness, the bending stiffness is too small by the fraction 1/n^2.  At a piece of the domain
 
-    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the volume at rest),
+    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume),
 
-with the coordinates xi of the domain in units of its edges.  D is the least-squares fit to the gradients of face
-neighbours of the same material.  e is then corrected so that int dV / det F, summed over the pieces, is the domain's
-volume at rest.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
+with the coordinates xi of the domain in units of its edges.  The slopes D are the least-squares fit to the gradients of
+face neighbours of the same material.  e is then corrected so that int dV / det F, summed over the pieces, is the
+reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ class Neighbours:
     Parameters
     ----------
     comm
-        The processes.
+        Communicator of the processes.
     bodies
         All bodies of the scene.
     ids : (n,)
         Numbers of the material points of this process.
     chosen : (n,)
-        Which of them have neighbours.
+        Whether neighbours of each point are sought.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):
         starts = np.cumsum([0, *map(len, bodies)])
         self.rows = rows = (chosen & (ids < starts[-1])).nonzero()[0]
-        """The points (k,) with neighbours."""
+        """Indices (k,) of the points whose neighbours are sought."""
         dim = bodies[0].dim
         of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.int64)
         for i, body in enumerate(bodies):
             chosen_rows = (of == i).nonzero()[0]
             corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
-            # equal for both sides of a face: its lowest corner, and the one diagonally opposite
+            # the same for both domains at a face: the lowest corner of the face, and the corner diagonally opposite
             first = corners.argmin(axis=2)[:, :, None]
             ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
             key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
@@ -66,12 +66,12 @@ class Neighbours:
         self._partners = _pairs(self._exchange.send(key[self._unpaired]))
         found = self._exchange.back(self._partners >= 0)
         partner[self._unpaired[found]] = len(key) + found.nonzero()[0]
-        self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face, -1 without
+        self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of the face: columns and face centres of the neighbours, and which neighbours exist.
+        """Return a function of the face number: columns, face centres (m) and existence of the neighbours at the face.
 
-        own (c, k): columns of these points; faces: centres (d, k), m, of each of their faces.
+        `own` (c, k) are the columns of these points.  `faces` are the centres (d, k), m, of their faces.
         """
         centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
@@ -85,18 +85,18 @@ class Neighbours:
 
         def of(face: int) -> tuple[NDArray, NDArray, NDArray]:
             at = self._partner[face]
-            return own[:, point[at]], centres[:, at], at >= 0
+            return own.take(point[at], axis=1), centres.take(at, axis=1), at >= 0
 
         return of
 
 
 class LinearGradients:
-    """Deformation gradients at the pieces of a scene.
+    """Deformation gradients at the pieces of the domains in a scene.
 
     Parameters
     ----------
     comm
-        The processes.
+        Communicator of the processes.
     bodies
         All bodies of the scene.
     """
@@ -108,7 +108,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients` for elastic points (n,) of a cut; a collective call."""
+        """Return `linear_gradients`, where F varies in `elastic` points (n,); all processes must call this method."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils
@@ -116,7 +116,7 @@ class LinearGradients:
 
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of the other entry with the same key, -1 without."""
+    """Return for each entry the index (n,) of the other entry with the same key, or -1."""
     order, out = key.argsort(kind="stable"), np.full(len(key), -1)
     same = (key[order[1:]] == key[order[:-1]]).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]
@@ -131,36 +131,34 @@ def linear_gradients(
     Parameters
     ----------
     neighbours
-        Neighbours of the domains in which F varies.
+        Neighbours of the domains in which F may vary.
     cut
         Cut particle domains.
     F : (n, k, k)
         Deformation gradients of the points.
     soils : (n, c)
-        Equal rows mark points of the same material.
+        Rows of numbers that are equal for points of the same material.
     """
-    # points or pieces are the last axis: numpy takes several times as long for rows of a few numbers each
+    # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction
     d, k = cut.grid.dim, F.shape[1]
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
     slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, soils)
-    offset = [x - sum_by(of, fraction * x, len(F))[of] for x in cut.pieces.x.T]
-    xi = [sum(inverse[a, b][of] * x for b, x in enumerate(offset)) for a in range(d)]
-    J, cofactors = determinant(F), cofactor(F).transpose(1, 2, 0).swapaxes(0, 1)
+    offset = [x - sum_by(of, fraction * x, len(F)).take(of) for x in cut.pieces.x.T]
+    xi = [sum(inverse[a, b].take(of) * x for b, x in enumerate(offset)) for a in range(d)]
+    J, base = determinant(F), F.transpose(1, 2, 0).copy()
+    cofactors = cofactor(F).transpose(2, 1, 0).copy()
     e = np.einsum("ijn,ajkn->aikn", cofactors / J, slope)
     ratio = np.trace(e, axis1=1, axis2=2)
-    # the mean is weighted by volumes at rest; the second-order part would change the domain's volume, so it is removed
-    shift, second = np.zeros((k, k, len(F))), np.zeros((k, k, len(F)))
-    for a, b in np.ndindex(d, d):
-        variance = sum_by(of, fraction * xi[a] * xi[b], len(F))
-        shift += variance * ratio[b] * slope[a]
-        second += 0.5 * variance * (ratio[b] * e[a] - np.einsum("ijn,jkn->ikn", e[a], e[b]))
-    base = F.transpose(1, 2, 0)
-    base = base - np.einsum("ijn,jkn->ikn", base, second) + shift
-    out = base[..., of] + sum(x * slope[a][..., of] for a, x in enumerate(xi))
+    # the mean is weighted by reference volumes; the second-order part would change the domain's volume and is removed
+    variances = sum_by(of, np.array([[fraction * x * y for y in xi] for x in xi]), len(F))
+    weight, part = np.einsum("abn,bn->an", variances, ratio), np.einsum("abn,bjkn->ajkn", variances, e)
+    second = 0.5 * (np.einsum("an,aikn->ikn", weight, e) - np.einsum("aijn,ajkn->ikn", e, part))
+    base = base - np.einsum("ijn,jkn->ikn", base, second) + np.einsum("an,aijn->ijn", weight, slope)
+    out = base.take(of, axis=2) + sum(x * slope[a].take(of, axis=2) for a, x in enumerate(xi))
     out = np.ascontiguousarray(out.transpose(2, 0, 1))
     ratios = determinant(out)
-    if (inverted := ratios <= 0).any():  # their domains keep one gradient
+    if (inverted := ratios <= 0).any():  # such domains keep a uniform gradient
         even = np.isin(of, of[inverted])
         out[even] = F[of[even]]
         ratios[even] = J[of[even]]
@@ -170,7 +168,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return derivatives (d, k, k, r) of F with respect to xi, and inverse edges (d, d, r) of domains, 1/m."""
+    """Return the derivatives (d, k, k, r) of F by xi, and the inverse edge matrices (d, d, r) of domains, 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners, bits = cut.points.corners[rows].transpose(1, 2, 0).copy(), corner_bits(d)
@@ -190,11 +188,10 @@ def _slopes(
             xi = np.einsum("abn,bn->an", inverse, neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d])
             xi[:, ~joined] = 0.0
             change = neighbours_columns[: k * k] - own[: k * k]
-            for a in range(d):
-                B[a] += xi[a] * change
-                A[a] += xi[a] * xi
+            B += xi[:, None] * change
+            A += xi[:, None] * xi
             some |= joined
-        A[axis, axis, ~some] += 1.0  # without a neighbour on this axis the slope is zero
+        A[axis, axis, ~some] += 1.0  # without a neighbour along this axis the slope is zero
     return np.einsum("abn,bmn->amn", _inverse(A), B).reshape(d, k, k, len(rows)), inverse
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tensors at positions in the bodies, fitted to the values of the points around (`LocalFit`)."""
+"""Tensors at positions in the bodies, fitted to the values of the surrounding points (`LocalFit`)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ def fitted_at(
     xi: NDArray[np.float64],
     tensor: Callable[[MaterialPoints], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return tensors (m, k, k) at positions in particle domains; collective over the processes.
+    """Return tensors (m, k, k) at positions in particle domains; all processes must call this function.
 
-    The fit uses points of the same body and material, weighted by distance at rest.  Removed domains get any value.
+    The fit uses points of the same body and material, weighted by the distance in the reference configuration.  Results
+    at domains that were removed are meaningless.
 
     Parameters
     ----------
     sizes
         Number of points of each body of the scene.
     id, xi : (m,), (m, d)
-        Numbers of the points, and coordinates in their domains; the same on all processes.
+        Numbers of the points, and local coordinates in their domains; the same on all processes.
     tensor
-        Function that returns the tensors (n, k, k) of points.
+        Function from material points to their tensors (n, k, k).
     """
     m = len(id)
     d = xi.shape[1]
@@ -66,12 +67,12 @@ def fitted_at(
     return fit.values(comm).reshape(m, *shape)
 
 
-def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return pairs of positions (m, d) and points at x (n, d) within a reach (m,) along each axis, all in m."""
-    low, high = ((places + sign * reach[:, None]).T for sign in (-1, 1))
+def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    """Return pairs of positions (m, d) and points at x (n, d) closer than `radius` (m,) along each axis; all in m."""
+    low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))
     if not len(some):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    found = cKDTree(x[some]).query_ball_point(places, reach, p=np.inf)
+    found = cKDTree(x[some]).query_ball_point(places, radius, p=np.inf)
     return np.repeat(np.arange(len(places)), list(map(len, found))), some[np.concatenate(found).astype(np.int64)]

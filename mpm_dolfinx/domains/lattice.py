@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
-A displacement wave of the corners with a length of two domains moves no node of the grid, so no stress resists it.
-Corners that cross grid lines excite such waves, which would grow from cycle to cycle.  The filter damps them when the
-grid is reset,
+A displacement wave of the corners with a wavelength of two domains does not move the nodes of the grid, so no stress
+resists it.  Corners that cross grid lines excite such waves, and the waves would grow from cycle to cycle.  The filter
+damps them when the grid is reset.  Along one axis a after the other,
 
-    d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
+    d <- d - D_a^T s / 64 D_a d,
 
-with the displacement d of the corners since rest.  D_a is the third difference along axis a, over four corners in a
-row.  For rows of unequal widths it is the divided difference, scaled to the same sum of absolute weights.  s is min(1,
-`FAST` c), with the number c of cells that the corners have crossed: bodies nearly at rest are not filtered.  Quadratic
-fields remain unchanged, also at the surface.  Along its axis a wave of two domains loses the fraction s, a wave of
-eight domains 0.003 s.  Domains that have separated from their neighbours are not filtered.  Nor is yielded soil: its
-deformation is irreversible, and its kinks are physical.  Corners held by a wall, a prescribed displacement, a plate or
-another body do not move.
+and the result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
+positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different
+widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), with the
+number c of cells that the corners have crossed; bodies that hardly move are not filtered.  Quadratic fields remain
+unchanged, also at the surface.  A wave of two domains along the axis is reduced by the fraction s, a wave of eight
+domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not filtered
+either: its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by a wall, a
+prescribed displacement, a plate or another body.
 """
 
 from __future__ import annotations
@@ -37,26 +38,26 @@ from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave of two domains that the filter removes, per crossed cell; at most 1.
+"""Fraction of a wave of two domains that the filter removes, for each crossed cell; at most 1.
 
-Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03 (relative changes of the result).
+Sensitivity (cycles scene): half the value changes the result by 1.5e-04, twice by 3.4e-04, finer cells by 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
-"""Number of lattice layers on each side that influence the change of a layer."""
+"""Number of neighbouring layers of the lattice, on each side, that influence the change of a layer."""
 
 
 class Lattice:
-    """Particle domains and corners of a present body, and its held corners; bodies from meshes are not filtered.
+    """Lattice of the domain corners of an active body, and the corners that are held.  Meshes are not filtered.
 
     Parameters
     ----------
     body, start
         The body, and the number of its first point.
     given : (faces, axes)
-        Faces of a side, and the components that a condition prescribes there.
+        Faces of sides, and the components that a condition prescribes there.
     contacts : (rows, corners)
-        Domains (m,) in contact with other bodies, and their corners (m, 4) in contact.
+        Domains (m,) that touch other bodies, and the corners (m, 4) of the touching faces.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Lattice:
             self._thirds = [_divided(body.corner_rows(axis)) for axis in range(self._dim)]
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._tolerance = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
-        # numbers of held corners: flags of all corners would be as large as the body, on every process
+        # stores numbers of held corners: flags for all corners would be as large as the body, on every process
         self._contacts = np.unique(np.take_along_axis(body.nodes(contacts[0]), contacts[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
@@ -99,7 +100,7 @@ class Lattice:
         return self._nodes(ids), self._held_of(ids)[1]
 
     def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return `given` of domains, and which of their corners (m, 2^d) touch other bodies."""
+        """Return the result of `given`, and which corners (m, 2^d) of the domains touch other bodies."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             number = self._nodes(ids)
@@ -108,15 +109,15 @@ class Lattice:
         return self._held(ids, held)
 
     def _nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers (m, 2^d) of the corners of domains."""
+        """Return the node numbers (m, 2^d) of the corners of domains."""
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the filter's change (m, 2^d, d), m, of the displacements d of domain corners.
+        """Return the change (m, 2^d, d), m, by which the filter corrects displacements of domain corners.
 
-        d : (m, 2^d, d), m; crossed (m, 2^d): number of cells crossed since the grid reset.
+        `d` (m, 2^d, d), m, are the displacements; `crossed` (m, 2^d) the numbers of cells crossed since the grid reset.
         """
         if self._count is None:
             return np.zeros_like(d)
@@ -136,20 +137,21 @@ def _change(
     tolerance: NDArray[np.float64],
     thirds: Sequence[NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the filter's change (m, k) of values on a lattice.
+    """Return the change (m, k) by which the filter corrects values on a lattice.
 
-    The lattice is distributed over the processes in slabs across its first axis.
+    The lattice is distributed over the processes in slabs along its first axis.
 
     Parameters
     ----------
     shape, number
-        Lattice sites along each axis; lexicographic number (m,) of the site of each row.  Rows may share a site.
+        Number of lattice sites along each axis; lexicographic number (m,) of the site of each row of values.  Several
+        rows may belong to one site.
     values : (m, k + 1)
         Values, and in the last column the number of crossed cells.
     tolerance : (k + 1,)
-        Largest difference between rows of a site; above it the site's domains have separated and it is left out.
+        Largest difference between rows of a site.  If it is exceeded, the domains have separated; the site is left out.
     thirds : (4, n - 3) along each axis
-        Weights of third differences along n corners, for rows of unequal widths, see `_divided`.
+        Weights of third differences of n corners, for domains of different widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -170,13 +172,14 @@ def _change(
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]
-            field[sites[(np.abs(field[sites] - d[part]) > tolerance).any(axis=1)]] = np.nan
+            apart = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
+            field[sites[np.logical_or.reduce(apart.T)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
-    if thirds is not None:  # of this slab
+    if thirds is not None:  # the part of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
     change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
     change[np.isnan(change)] = 0.0
-    return exchange.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
+    return exchange.back(change.reshape(-1, values.shape[1] - 1).take(rows[0][0], axis=0))
 
 
 def _filtered(
@@ -185,10 +188,10 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None = None,
     axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values, filtered along axes (default: all); nan marks missing sites.
+    """Return values on a box (..., k) of sites, filtered along some axes (default: all); nan marks missing sites.
 
     Filters along two axes do not commute where s varies.  The mean over all orders of the axes makes the result
-    independent of a rotation by a right angle.
+    independent of rotations by right angles.
     """
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
@@ -200,9 +203,9 @@ def _filtered(
 
 
 def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights (4, n - 3) of third differences at positions (n,); absolute weights sum to 8.
+    """Return the weights (4, n - 3) of third differences at positions (n,).  The absolute weights add up to 8.
 
-    The differences of quadratic functions vanish.
+    Third differences of quadratic functions are zero.
     """
     rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
     distances = rows[:, None] - rows[None]
@@ -213,7 +216,7 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return a box (..., k) of values, filtered along one axis; weights: see `_divided`, None for equal widths."""
+    """Return values on a box (..., k), filtered along one axis.  `weights`: see `_divided`; None for equal widths."""
     out, count = d.copy(), d.shape[axis]
     along, cells = out.swapaxes(axis, 0), crossed.swapaxes(axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
@@ -228,7 +231,7 @@ def _along(
 def lattices(
     bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
 ) -> list[Lattice]:
-    """Return the lattices of the present bodies; given: pairs of prescribed faces and their prescribed components."""
+    """Return the lattices of the active bodies.  `given` are prescribed faces, each with the prescribed components."""
     start = np.cumsum([0, *map(len, bodies)])
     around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
     out = []
@@ -242,7 +245,10 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed or fixed; walls: name -> its fixed components."""
+    """Return which components (n, 2^d, d) of corners are prescribed by a condition or fixed by a wall.
+
+    `walls` are the fixed components of each wall, by name.
+    """
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -279,9 +285,9 @@ def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray
 def filtered(
     grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the filter's change of the corners (n, 2^d, d), m.
+    """Return the change of the corners (n, 2^d, d), m, by the filter.
 
-    then: the points at the grid reset; free (n,): which points are filtered.
+    `then` are the points at the grid reset.  `free` (n,) tells which points are filtered.
     """
     out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
     for lattice in lattices:
@@ -292,5 +298,5 @@ def filtered(
 
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the number of cells crossed by corners (n, 2^d) since the grid reset; 0 for points that are not free."""
+    """Return the number of cells crossed by corners (n, 2^d) since the grid reset; 0 for points that are not `free`."""
     return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Conservative remap of the pore pressure from one grid to the next, of second order.
 
-In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of the cell's storage.  The slope s
-along an axis is van Leer's mean of two differences: to the neighbours across open faces, or to the pressure of a
-drained side.  If one of them is missing, s is zero.  The slope is scaled so that the pressure in the cell stays between
+In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of the cell's storage.  Along an
+axis, the slope s is van Leer's mean of two slopes: to the neighbours across open faces, or to the pressure on a drained
+side.  If one of the two is missing, s is zero.  The slope is then scaled so that the pressure in the cell stays between
 the extremes of cell, neighbours and drained sides.
 
-A piece of a particle domain takes the pressure at its centroid and moves with the domain.  Then the domain is cut
-again.  In a cell that contained the domain before, the common part keeps its pressure.  A part that is new in a cell
-takes the mean pressure of the parts that left other cells.  The centroids of the pieces are remapped in the same way.
-Their error times the mean slope of the domain corrects the pressure.  The fractions of a domain sum to one, and this
-correction sums to zero, so the remap is conservative.  Without motion it changes nothing.
+A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
+again.  If a cell contained the domain before, the common part keeps its pressure.  A part of the domain that is new in
+a cell receives the mean pressure of the parts that left other cells.  The centroids of the pieces are remapped in the
+same way.  The error of the remapped centroid, times the mean slope of the domain, corrects the pressure.  The fractions
+of a domain add up to one, and the corrections add up to zero, so the remap is conservative.  Without motion it changes
+nothing.
 
-Point pressures for output use a reconstruction up to no-flow sides, which is not transported: see `up_to_surface`.
+Point pressures for output are reconstructed up to no-flow sides, see `up_to_surface`.  They are not transported.
 """
 
 from __future__ import annotations
@@ -34,23 +35,20 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """Pore pressure of a scene between two steps; arrays over the pieces of domains, ordered by point and cell.
+    """Pore pressure of a scene between two steps; arrays over the m pieces of domains, ordered by point and cell.
 
-    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) fraction of the
-    domain; x : (m, d) present centroid, m.  For pieces that go to the next grid, else None: pressure : (m,) at the
-    centroid, Pa; slope : (m, d) its gradient, Pa/m; bounds : (m, 2) smallest and largest pressure allowed in the piece,
-    Pa.  For pieces that stay, else None: of_cell, start : (m,) pressure of the cell now and at the reset, Pa.
+    Pieces to be moved to the next grid have pressures at their centroids; pieces that stay have pressures of cells.
     """
 
-    id: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    fraction: NDArray[np.float64]
-    pressure: NDArray[np.float64] | None
-    x: NDArray[np.float64]
-    slope: NDArray[np.float64] | None
-    bounds: NDArray[np.float64] | None
-    of_cell: NDArray[np.float64] | None = None
-    start: NDArray[np.float64] | None = None
+    id: NDArray[np.int64]  # number of the point (m,)
+    cell: NDArray[np.int64]  # lexicographic cell (m,); -1 at the start
+    fraction: NDArray[np.float64]  # fraction of the domain (m,)
+    pressure: NDArray[np.float64] | None  # pressure at the centroid (m,), Pa; None for pieces that stay
+    x: NDArray[np.float64]  # current centroid (m, d), m
+    slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for pieces that stay
+    bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for pieces that stay
+    of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; None for pieces to be moved
+    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None likewise
 
     def __post_init__(self):
         for rows in self.arrays.values():
@@ -62,28 +60,28 @@ class PiecePressures:
         return {name: rows for name, rows in vars(self).items() if rows is not None}
 
     def migrated(self, exchange: Exchange) -> PiecePressures:
-        """Return the pieces of this process after the exchange of their points."""
+        """Return the pieces that this process has after the exchange of their points."""
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials in place of pressures, for a fluid with this bulk modulus, Pa: see `transport`."""
+        """Return mass potentials in place of pressures, for a fluid of bulk modulus `bulk`, Pa, see `transport`."""
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
     def less(self, slope: NDArray[np.float64]) -> PiecePressures:
-        """Return the pressures minus a field with a uniform slope (d,), Pa/m."""
+        """Return the pressures minus a field with uniform slope (d,), Pa/m."""
         even = self.x @ slope
         bounds = self.bounds - even[:, None]
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
-        """Return the pieces of the points with these ids, or (kept=False) of all other points."""
+        """Return the pieces of the points with these ids or, if not `kept`, of all other points."""
         rows = np.isin(self.id, ids) == kept
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and others, of points new on the grid; no piece stays on this grid."""
+        """Return these pieces and the pieces of points that are new on the grid; none of them stays on this grid."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -96,7 +94,7 @@ class PiecePressures:
 
 
 def at_start(points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of points that have not been in a cell yet: one piece each, with uniform pressure."""
+    """Return the pressures of points that were not in a cell before: one piece each, with uniform pressure."""
     n, p = len(points), points.pressure
     cell = np.full(n, -1)
     slope = np.zeros_like(points.x)
@@ -105,18 +103,14 @@ def at_start(points: MaterialPoints) -> PiecePressures:
 
 
 class CellPressures(NamedTuple):
-    """Data for slopes in owned cells.
+    """Pressures of cells, and data for their slopes in n owned cells; c local cells."""
 
-    cells : (n,) owned cells.  For all local cells: p : (c,), Pa; centroid : (c, d), m, relative to the midpoints;
-    faces : (c, d, 2) open fractions, zero for empty cells.  outer : (n, d, 2, 2), by axis and end: difference to the
-    pressure on a drained side, Pa, and slope to it, Pa/m; nan without a drained side.
-    """
-
-    cells: NDArray[np.int64]
-    p: NDArray[np.float64]
-    centroid: NDArray[np.float64]
-    faces: NDArray[np.float64]
-    outer: NDArray[np.float64]
+    cells: NDArray[np.int64]  # owned cells (n,)
+    p: NDArray[np.float64]  # pressure (c,), Pa
+    centroid: NDArray[np.float64]  # centroid relative to the midpoint of the cell (c, d), m
+    faces: NDArray[np.float64]  # open fractions of the faces (c, d, 2), zero for empty cells
+    # by axis and end of owned cells: pressure difference to a drained side, Pa, and slope, Pa/m; nan if not drained
+    outer: NDArray[np.float64]  # (n, d, 2, 2)
 
 
 class Reconstruction:
@@ -136,9 +130,9 @@ class Reconstruction:
     def __call__(
         self, pressures: CellPressures, origin: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return slopes (n, d), Pa/m, and bounds (n, 2), Pa, of the pressures of cells.
+        """Return slopes (n, d), Pa/m, and bounds (n, 2), Pa, of the pressures in cells.
 
-        origin (n, d), m: position of the cell's pressure relative to its midpoint.
+        `origin` (n, d), m, is the position to which the cell's pressure refers, relative to the cell's midpoint.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, _, drained = self._differences(pressures)
@@ -152,9 +146,9 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return differences and slopes to neighbours and drained sides, and which neighbours and sides exist.
+        """Return differences and slopes to neighbours and drained sides, and which neighbours and drained sides exist.
 
-        All (n, d, 2), by axis and end; zero without a neighbour or drained side.
+        All have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
         """
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
@@ -173,9 +167,9 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at positions in owned cells (n,), of second order also in cells at the surface.
 
-        At a no-flow side the slope is the slope of the next cell inside, or the linear extrapolation of the slopes if
-        this is smaller.  Linear fields are exact, and steep slopes are not continued.  Pressures stay within cell,
-        neighbours, drained sides, and the value of this slope at the surface.
+        In a cell at a no-flow side, the slope is that of the next cell inside, or the linear extrapolation of the
+        slopes if this is smaller.  Linear fields are exact, and steep slopes are not continued.  Pressures stay between
+        the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
 
         Parameters
         ----------
@@ -202,7 +196,7 @@ class Reconstruction:
         return p[cells[slot]] + share_within(increment, low, high, slot)[slot] * increment
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return slopes of owned cells (n, d) as an array over local cells, including active ghosts."""
+        """Return slopes (n, d) of owned cells as an array over all local cells, with ghosts."""
         out = self._slope.x.array.reshape(-1, self.grid.dim)
         out[cells] = slope
         self._slope.x.scatter_forward()
@@ -210,7 +204,7 @@ class Reconstruction:
 
 
 def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the harmonic means (n, d) of slopes to both sides (n, d, 2), zero where their signs differ."""
+    """Return the harmonic means (n, d) of the slopes to both sides (n, d, 2); zero where their signs differ."""
     a, b = one_sided[..., 0], one_sided[..., 1]
     return np.divide(2 * a * b, a + b, out=np.zeros(a.shape), where=a * b > 0)
 
@@ -218,7 +212,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factors (n,) with which all increments (m,) in a cell stay between its low and high (n,)."""
+    """Return the largest factors (n,) of cells that keep increments (m,) in a cell between `low` and `high` (n,)."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -226,7 +220,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest (<= 0) and largest (>= 0) difference to neighbours (n,), from differences (n, d, 2)."""
+    """Return the smallest (<= 0) and largest (>= 0) difference (n,) to neighbours, from all differences (n, d, 2)."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 
@@ -250,7 +244,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     share = common / new.fraction
 
     def remapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values of the new pieces: the old value on the common part, elsewhere the mean of parts that left."""
+        """Return values of the new pieces: the old value on the common part, else the mean of the parts that left."""
         mean = np.divide(sum_by(owner, left_fraction * values, n), leaving, out=np.zeros(n), where=leaving > 0)
         old_values = np.zeros(len(new_key))
         old_values[match] = values[before]
@@ -267,7 +261,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor (m,) of a correction, equal for all pieces of a domain, that respects the bounds."""
+    """Return the factor (m,) of a correction that respects the bounds.  It is equal for all pieces of a domain."""
     first = np.diff(owner, prepend=-1).nonzero()[0]
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of particle domains: choice of the cells, new domains in them, and transfer of values from the old ones."""
+"""Renewal of particle domains: choice of cells, new domains in these cells, and transfer of values from old domains."""
 
 from __future__ import annotations
 
@@ -28,61 +28,54 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap, in cells, between faces of two domains that still form one surface.
+"""Largest gap, in cells, between faces of two domains that still count as one surface.
 
-Plateau (flow): halved 2.5e-05, doubled 0.0e+00, cells 9.0e-02 (relative changes of the result).
+Sensitivity (flow scene): half the value changes the result by 2.5e-05, twice by 0.0e+00, finer cells by 9.0e-02.
 """
 CRUMB = NEAR
-"""Area, in cells, below which a part of a domain is dropped; its other parts take over its mass.  Source: as `NEAR`."""
+"""Area, as a fraction of the cell, below which a part is dropped; other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Fraction of a cell's area: a cell with a smaller remainder of a domain is renewed as well.
+"""Area limit, as a fraction of the cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
-Source: definition, half of an edge wide.
+Source: definition, a square half of an edge wide.
 """
 COVERED = 0.25
-"""Largest difference between the pieces' area and a cell's filled area, in cells.  Source: definition, one domain."""
+"""Largest difference between pieces' area and filled area of a cell, in cells.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
-"""Face of a domain for each edge of the ring."""
+"""Face of a domain for each edge of the ring of its corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
-"""Corners at which each face starts and ends, anti-clockwise."""
+"""Corners at which each face starts and ends, anticlockwise."""
 
 
 class Parts(NamedTuple):
-    """Parts of the surface in cells; row (m,): face; cell (m,); x (m, 2, 2): ends, in cell coordinates in [0, 1].
+    """Parts of the surface, each in one cell; arrays over m parts."""
 
-    t (m, 2): coordinates of the ends along the face, in [0, 1]; side (m,): side of the cell on which it lies, or -1.
-    """
-
-    row: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    x: NDArray[np.float64]
-    t: NDArray[np.float64]
-    side: NDArray[np.int64]
+    row: NDArray[np.int64]  # face (m,)
+    cell: NDArray[np.int64]  # cell (m,)
+    x: NDArray[np.float64]  # ends in cell coordinates in [0, 1] (m, 2, 2)
+    t: NDArray[np.float64]  # coordinates of the ends along the face, in [0, 1] (m, 2)
+    side: NDArray[np.int64]  # side of the cell on which the part lies, or -1 (m,)
 
 
 @dataclass(frozen=True)
 class OuterFaces:
-    """Faces of domains (m,) on the surface.
+    """Faces of domains on the surface of the bodies; arrays over m faces."""
 
-    point, face, key (m,): point, number and key of the face; area (m,): length as seeded, m; ends (m, 2, 2): reference
-    positions of the ends, m, the lower end first.
-    """
-
-    point: NDArray[np.int64]
-    face: NDArray[np.int64]
-    key: NDArray[np.int64]
-    area: NDArray[np.float64]
-    ends: NDArray[np.float64]
+    point: NDArray[np.int64]  # material point (m,)
+    face: NDArray[np.int64]  # number of the face in its domain (m,)
+    key: NDArray[np.int64]  # key of the seeded face (m,), see `renewed_faces`
+    area: NDArray[np.float64]  # seeded length (m,), m
+    ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (m, 2, 2), m
 
 
 class New(NamedTuple):
-    """New domains: corners (n, 4, 2), m; group (n,) with common values; keys (parent), lengths and ends of faces."""
+    """New particle domains; arrays over n domains."""
 
-    corners: NDArray[np.float64]
-    group: NDArray[np.int64]
-    parent: NDArray[np.int64]
-    area: NDArray[np.float64]
-    ends: NDArray[np.float64]
+    corners: NDArray[np.float64]  # (n, 4, 2), m
+    group: NDArray[np.int64]  # domains of a group receive values from the same pieces (n,)
+    parent: NDArray[np.int64]  # key of the seeded face for each face, or -1 (n, 4)
+    area: NDArray[np.float64]  # seeded length of each face (n, 4), m
+    ends: NDArray[np.float64]  # reference positions of the ends of each face (n, 4, 2, 2), m
 
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
@@ -95,16 +88,16 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
 
 
 class RefilledCells:
-    """Renewal of domains in one grid reset.
+    """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
     Parameters
     ----------
     grid, points, body
-        Grid, points, and the body (n,) of each point.
+        Background grid, material points, and the body (n,) of each point.
     flowed, needs
-        Which points (n,) may be renewed, and which domains (n,) need renewal.
+        Whether points (n,) may be renewed, and whether their domains (n,) need renewal.
     faces, signs
-        Surface, and conditions on it, see `_signatures`.
+        Surface of the bodies, and the conditions on its faces, see `_signatures`.
     """
 
     def __init__(
@@ -133,20 +126,20 @@ class RefilledCells:
         self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
         """Cells to renew."""
         self.affected = self._at(self.chosen)
-        """Which points (n,) lose their domains or parts of them."""
+        """Whether points (n,) lose their domains or parts of these."""
 
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
-        """Return the volumes (n,), m^2, of cells (n,); one number for equal cells."""
+        """Return the areas (n,), m^2, of cells (n,); one number for equal cells."""
         return self.grid.sizes_of(cells).prod(axis=-1)
 
     def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which points (n,) have a piece in some cells."""
+        """Return which points (n,) have a piece in any of the cells."""
         out = np.zeros(len(self.points), dtype=bool)
         out[self.pieces.point[cells[self.cell]]] = True
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return cells that cannot be renewed: with other soil, several bodies, or faces with different conditions."""
+        """Return cells that cannot be renewed: with other points, several bodies, or faces of different conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -166,7 +159,7 @@ class RefilledCells:
     def _chosen(
         self, needed: NDArray[np.bool_], excluded: NDArray[np.bool_], small: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the cells to renew: cells of points (n,) that need it, and cells with small remainders of domains."""
+        """Return the cells to renew: cells of `needed` points (n,), and cells with `small` remaining parts."""
         of, cell = self.pieces.point, self.cell
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[needed[of]]] = True
@@ -179,7 +172,7 @@ class RefilledCells:
         return chosen
 
     def _parts(self, faces: OuterFaces) -> Parts:
-        """Return the parts of the surface in cells."""
+        """Return the surface of the bodies, divided into parts by the cells."""
         grid = self.grid
         corners = self.points.corners[faces.point]
         n = np.arange(len(faces.face))
@@ -206,9 +199,9 @@ class RefilledCells:
         return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
 
     def _chains(self, excluded: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
-        """Return the cells crossed by the surface, and the material region of cells that it crosses once.
+        """Return which cells the surface crosses, and the filled region of the cells that it crosses once.
 
-        Cells crossed more than once are barred.
+        Cells that the surface crosses more than once are excluded.
         """
         inner = self.parts.side == NONE
         cell, x = self.parts.cell[inner], self.parts.x[inner]
@@ -243,17 +236,17 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of each renewed cell among these."""
+        """Return the number of each of these cells among the renewed cells."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
     def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (n, k, 2), m, of local coordinates y (n, k, 2) in cells (n,), from 0 to 1."""
+        """Return the positions (n, k, 2), m, of local coordinates y (n, k, 2), from 0 to 1, in cells (n,)."""
         index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
         return self.grid.places(np.broadcast_to(index[:, None], y.shape), y)
 
     def full(self) -> New:
-        """Return the new domains of full cells."""
+        """Return the new domains of full cells: each cell is divided into four equal domains."""
         cells = np.flatnonzero(self.chosen & ~self.crossed)
         bits = corner_bits(2)
         y = (bits[:, None] + bits[None]) / 2  # (4 domains, 4 corners, 2)
@@ -262,7 +255,7 @@ class RefilledCells:
         return self._partial(of, local, *_no_faces(len(of)))
 
     def partial(self) -> New:
-        """Return the new domains of cells crossed by the surface."""
+        """Return the new domains of cells that the surface crosses."""
         inner = np.flatnonzero(self.parts.side == NONE)
         parts = Parts(*(column[inner] for column in self.parts))
         order = np.argsort(parts.cell, kind="stable")
@@ -275,7 +268,7 @@ class RefilledCells:
         key, X = self._nearest(parts, order, cells[at], lower, upper)
         parent[at, face], ends[at, face] = key, X
         edge = np.linalg.norm(upper - lower, axis=1)
-        total = sum_by(cells[at], edge, self.cells)  # of all new edges on the surface
+        total = sum_by(cells[at], edge, self.cells)  # length of all new edges on the surface
         area[at, face] = edge / total[cells[at]] * whole[cells[at]]
         return self._partial(cells, local, parent, area, ends)
 
@@ -289,7 +282,8 @@ class RefilledCells:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return keys (m,) of edges in cells (m,), and reference positions (m, 2, 2), m, of their ends.
 
-        The key is that of the surface part nearest to the middle of an edge; for the ends the nearest parts count.
+        The key is that of the surface part nearest to the middle of the edge.  Reference positions of the ends come
+        from the parts nearest to the ends.
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
@@ -309,7 +303,7 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2), m, of coordinates t (m,) on faces, from 0 at their start to 1."""
+        """Return the reference positions (m, 2), m, at coordinates t (m,) on faces, from 0 at the start to 1."""
         face = self.faces.face[row]
         flipped = START[face] != FACES[2][face, 0]
         share = np.where(flipped, 1 - t, t)[:, None]
@@ -324,7 +318,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains of cells (n,), with surface faces on sides of cells that belong to the surface."""
+        """Return new domains of cells (n,), with surface faces also on sides of cells that belong to the surface."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -359,17 +353,17 @@ class RefilledCells:
 
     @property
     def remainders(self) -> New:
-        """Remainders of removed domains outside the renewed cells."""
+        """New domains for the remaining parts of removed domains outside the renewed cells."""
         return self._remainders[0]
 
     @property
     def outside(self) -> NDArray[np.int64]:
-        """Pieces of removed domains outside the renewed cells."""
+        """Indices of the pieces of removed domains outside the renewed cells."""
         return self._remainders[1]
 
     @cached_property
     def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """Remainders of removed domains outside the renewed cells, one group per piece; and their pieces."""
+        """The results of `remainders` and `outside`; each piece is one group."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
@@ -412,10 +406,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k), 1/m, of values (points, k) in the cells of new domains.
-
-        They are a least-squares fit to the pieces in the cell.
-        """
+        """Return least-squares slopes (n, 2, k), 1/m, of values (points, k) of the pieces in cells of new domains."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -429,7 +420,7 @@ class RefilledCells:
         normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
         right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
         value, axes = np.linalg.eigh(normal)
-        some = value > SAME  # cells squared: pieces in a row determine no slope across the row
+        some = value > SAME  # in cells squared: a single row of pieces determines no slope across the row
         inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         sizes = grid.sizes_of(np.arange(self.cells))[..., None]
         slope = (axes * inverse[:, None]) @ axes.swapaxes(1, 2) @ right / sizes
@@ -437,14 +428,14 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of removed domains; the group that receives each piece; the piece's fraction of its domain."""
+        """Pieces of removed domains, the group that receives each piece, and the piece's fraction of the domain."""
         pieces = self.pieces
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, self.outside])
         groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.outside))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
-        return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped slivers
+        return piece, groups, share / whole[pieces.point[piece]]  # with the mass of dropped parts
 
     def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
         """Return pairs of old and new domains: both indices, and the fraction of the old mass in the new domain."""
@@ -457,7 +448,7 @@ class RefilledCells:
         common = np.zeros(len(of))
         rings, which = _convex(self.points.corners[old], self._volume(self.cell[piece[of]]))
         common += np.maximum(sum_by(which, rings.within(corners[at][which][:, RING]).area, len(of)), 0.0)
-        common += EPSILON * np.abs(volumes(corners[at]))  # a domain without an overlap gets the mean of its cell
+        common += EPSILON * np.abs(volumes(corners[at]))  # a domain without overlap receives the mean of its cell
         total = sum_by(of, common, len(piece))
         return old, at, share[of] * common / total[of]
 
@@ -469,7 +460,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return the values (n, ...) of new domains on their faces: means over the old surface in their cell."""
+        """Return the values (n, ...) of new domains for data on their faces: means over the old surface in the cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -485,14 +476,14 @@ class RefilledCells:
 
 
 def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return keys, lengths and ends for n domains without faces on the surface."""
+    """Return keys, lengths and ends of faces for n domains without faces on the surface."""
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Return domains (n, 4, 2) as convex polygons with face numbers of their edges, and the domain of each polygon.
+    """Divide domains (n, 4, 2) into convex polygons; return these with face numbers of edges, and the domain of each.
 
-    volume (n,): volumes of their cells, m^2.
+    `volume` (n,) are the areas of their cells, m^2.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faces of renewed domains, and the seeded faces of bodies that they represent."""
+"""Faces of renewed particle domains, and the seeded faces of bodies that they represent."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of point data for each face: key of the seeded face, -1 for none; seeded area, m; reference ends, m."""
+"""Names of point data for each face: key of the seeded face, or -1; seeded length, m; reference ends, m."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return keys (m,) of faces of seeded points, in the plane."""
+    """Return a key (m,) for faces of seeded points, in 2D."""
     return 4 * np.asarray(point, dtype=np.int64) + face
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with data of renewed faces; if missing, they start without renewed faces."""
+    """Return the points with data of renewed faces.  If the data are missing, no face is renewed."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -35,23 +35,18 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 
 @dataclass(frozen=True)
 class RenewedFaces:
-    """Faces of renewed domains on surfaces (m,).
+    """Faces of renewed domains on surfaces; arrays over m faces."""
 
-    row : index of the seeded face among the faces of all these surfaces; at, face : index of the point, and number of
-    its face; xi : (m, 2, 2) corners of the part of the face within the surface; area : (m,), ends : (m, 2, 2), m, see
-    `AREA` and `ENDS`; old : (n,) which positions lie on seeded faces, None if rows are not positions.
-    """
-
-    row: NDArray[np.int64]
-    at: NDArray[np.int64]
-    face: NDArray[np.int64]
-    xi: NDArray[np.float64]
-    area: NDArray[np.float64]
-    ends: NDArray[np.float64]
-    old: NDArray[np.bool_] | None = None
+    row: NDArray[np.int64]  # index of the seeded face among the faces of all these surfaces (m,)
+    at: NDArray[np.int64]  # index of the point (m,)
+    face: NDArray[np.int64]  # number of the face in its domain (m,)
+    xi: NDArray[np.float64]  # corners of the part of the face in the surface, local coordinates (m, 2, 2)
+    area: NDArray[np.float64]  # seeded length (m,), m, see `AREA`
+    ends: NDArray[np.float64]  # reference positions of the ends (m, 2, 2), m, see `ENDS`
+    old: NDArray[np.bool_] | None = None  # if rows are positions: whether each lies on a seeded face (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each position (n,); number: index among the renewed faces, negative on a seeded face."""
+        """Return the face of each position (n,), from its index among renewed faces; negative on a seeded face."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -64,13 +59,13 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of parts and whole faces, m, and face numbers (n,); renewed faces replace the given values."""
+        """Return areas of parts and of whole faces, m, and face numbers (n,), after replacement at renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
 
     def reference(self, X: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2), m, of coordinates xi (n, 2); on seeded faces X (n, 2), m."""
+        """Return the reference positions (n, 2), m, at local coordinates xi (n, 2); on seeded faces X (n, 2), m."""
         along = xi[np.arange(len(xi)), 1 - self.face // 2]
         share = (1 + along[:, None]) / 2
         new = self.ends[:, 0] + share * (self.ends[:, 1] - self.ends[:, 0])
@@ -78,7 +73,7 @@ class RenewedFaces:
 
 
 def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> RenewedFaces:
-    """Return the faces of renewed domains on several surfaces, concatenated."""
+    """Return the faces of renewed domains on several surfaces, in the order of the surfaces."""
     at, face = np.nonzero(points.data[PARENT] >= 0)
     key = points.data[PARENT][at, face]
     area, ends = points.data[AREA][at, face], points.data[ENDS][at, face]
@@ -104,7 +99,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the interval (m,), (m,), in [0, 1], in which edges with ends (m, 2, 2), m, lie in a region (2, 2), m."""
+    """Return the bounds (m,), (m,), in [0, 1] of the parts of edges (m, 2, 2), m, inside a region (2, 2), m."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     edge_vector = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(edge_vector).max(axis=1)

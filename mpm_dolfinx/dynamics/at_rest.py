@@ -18,7 +18,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
 
-def borne(
+def balancing_tractions(
     cut: CutDomains,
     points: MaterialPoints,
     stresses: Mapping[str, NDArray[np.float64]],
@@ -51,24 +51,24 @@ def borne(
     own = np.concatenate([p.area(points) for p in patches])
     stress = np.concatenate([of[p.face, :d, :d] for of, p in zip(stresses.values(), patches, strict=True)])
     t = np.einsum("nij,nj->ni", stress, own) / area[:, None]
-    travel, places = owners(grid, patches)
-    part, nodes = travel.back(parts.cells[places.cells]), parts.nodes[: len(forces)]
+    exchange, places = owners(grid, patches)
+    part, nodes = exchange.back(parts.cells[places.cells]), parts.nodes[: len(forces)]
     for one in range(parts.count):
-        here, there = part == one, nodes == one
-        if not over_all(grid.comm, int(here.sum())):
+        own_points, own_nodes = part == one, nodes == one
+        if not over_all(grid.comm, int(own_points.sum())):
             continue
-        free = over_all(grid.comm, held[: len(forces)][there].sum(axis=0)) == 0
+        free = over_all(grid.comm, held[: len(forces)][own_nodes].sum(axis=0)) == 0
         if grid.axisymmetric:  # radial forces have no resultant
             free[0] = False
-        sums = over_all(grid.comm, np.append(area[here] @ x[here], area[here].sum()))
+        sums = over_all(grid.comm, np.append(area[own_points] @ x[own_points], area[own_points].sum()))
         on_side, on_nodes = (
-            _rigid(v - sums[:-1] / sums[-1], free) for v in (x[here], grid.node_x[: len(forces)][there])
+            _rigid(v - sums[:-1] / sums[-1], free) for v in (x[own_points], grid.node_x[: len(forces)][own_nodes])
         )
-        gram = np.einsum("n,knd,lnd->kl", area[here], on_side, on_side)
-        lacks = np.einsum("knd,nd->k", on_nodes, forces[there])
-        lacks -= np.einsum("n,knd,nd->k", area[here], on_side, t[here])
+        gram = np.einsum("n,knd,lnd->kl", area[own_points], on_side, on_side)
+        lacks = np.einsum("knd,nd->k", on_nodes, forces[own_nodes])
+        lacks -= np.einsum("n,knd,nd->k", area[own_points], on_side, t[own_points])
         gram, lacks = over_all(grid.comm, gram), over_all(grid.comm, lacks)
-        t[here] += np.einsum("k,knd->nd", np.linalg.lstsq(gram, lacks, rcond=ROUND_OFF)[0], on_side)
+        t[own_points] += np.einsum("k,knd->nd", np.linalg.lstsq(gram, lacks, rcond=ROUND_OFF)[0], on_side)
     out, start = {}, 0
     for name, p in zip(surfaces, patches, strict=True):
         chosen, number = np.unique(p.at, return_inverse=True)

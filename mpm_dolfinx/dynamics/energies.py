@@ -23,13 +23,15 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
     """Return the kinetic and elastic energies, J, of points; all processes call it together."""
     mass = materials.present_density(points) * points.volume0 * points.J
     v, L = points.data[VELOCITY], velocity_gradients(points)
-    spread = spreads(points.corners, materials.grid.axisymmetric)
-    turning = np.einsum("nij,njk,nik->n", L, spread, L)
+    moments = spreads(points.corners, materials.grid.axisymmetric)
+    turning = np.einsum("nij,njk,nik->n", L, moments, L)
     kinetic, elastic = mass @ ((v**2).sum(axis=1) + turning) / 2, materials.stored(points) @ points.volume0
     return dict(zip(("kinetic", "elastic"), over_all(materials.grid.comm, np.array([kinetic, elastic])), strict=True))
 
 
-def begun(materials: SceneMaterials, points: MaterialPoints, kinetic: float) -> dict[str, NDArray[np.float64]]:
+def initial_energies(
+    materials: SceneMaterials, points: MaterialPoints, kinetic: float
+) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, at the start of the count, see `Result.energies`; `internal`: work of the stresses.
 
     kinetic: kinetic energy of free tools, J.

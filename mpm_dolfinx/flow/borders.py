@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Interfaces between unsaturated soils of different conductivity: faces between cells, and cells of several soils.
+"""Interfaces between unsaturated soils of different conductivity: faces between cells, and cells with several soils.
 
-Fluxes through these faces follow from `series`; all other faces have two-point fluxes in UFL.
+`series` computes the fluxes through these faces.  All other faces have two-point fluxes in UFL.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 
 
 class Borders:
-    """Faces between cells of different soil, since the grid reset.
+    """Faces between cells of different soil, as of the last grid reset.
 
     Parameters
     ----------
     contents
-        Contents of the cells.
+        Material in the cells.
     cells, soils, law
-        Cell (m,) of each piece; rows (m, k), equal for equal soil; numbers (m,) of the pieces' retention curves.
+        Arrays over the m pieces: cell (m,); numbers (m, k) that are equal for the same soil; retention curve (m,).
     facets
-        Faces of this process between two active cells.
+        Facets of this process between two active cells.
     mixed
-        Mixed cells, or None.
+        Cells with several soils, or None.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Borders:
         known = np.zeros((grid.num_local, 2 + soils.shape[1]))
         known[cells, 1:] = np.column_stack([law, soils])
         self.mixed = np.full(grid.num_local, -1)
-        """Index of each local cell among the owned mixed cells, else -1."""
+        """Index of each local cell among the owned mixed cells, or -1."""
         if mixed is not None:
             self.mixed[mixed.cells] = np.arange(len(mixed.cells))
             known[mixed.cells, 0] = 1.0
@@ -62,29 +62,29 @@ class Borders:
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
         self.facets, self.uniform = facets[differ], facets[~differ]
-        """Faces of this process between cells of different soil, and the other faces."""
+        """Facets of this process between cells of different soil, and all other facets."""
         offset = grid.midpoints[grid.facet_cells[self.facets]]
         offset = offset[:, 1] - offset[:, 0]
         self._axis = np.abs(offset).argmax(axis=1)
         downward = np.take_along_axis(offset, self._axis[:, None], axis=1) < 0
         self._pair = np.where(downward, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
-        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # for requests of others
+        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # other processes may request them
         self._cells = np.unique(np.append(self._pair, of_others))
         self._slot = np.searchsorted(self._cells, self._pair)
 
     def faces(
         self, laws: Any, contents: CellContents, flow: Conduction, places: NDArray[np.float64], moved: NDArray
     ) -> BorderFaces:
-        """Return the faces for the present conductivities.
+        """Return the faces with their current conductivities.
 
         Parameters
         ----------
         laws
-            Conductivities by the pressure, see `Laws`.
+            Relative conductivities as functions of pressure, see `Laws`.
         contents, flow
-            Contents of the cells, and conductivities of the filled owned cells.
+            Material in the cells, and conductivities of the filled owned cells.
         places, moved
-            Vectors (c, d), m, of the local cells: from midpoint to pressure position, and displacement.
+            Vectors (c, d), m, for local cells: midpoint to pressure position, and displacement in the step.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1
@@ -113,7 +113,7 @@ class Borders:
         ]
         lengths = [np.maximum(length, EPSILON * edge) for length, edge in zip(lengths, across, strict=True)]
         shift = moved + places - contents.centroid
-        drift = (shift[other] - shift[first]) / 2  # both cells share the motion of the face
+        drift = (shift[other] - shift[first]) / 2  # the face moves with the mean of both cells
         offsets = [
             across[i][:, None] / 2 * unit - sign * contents.centroid[cells] + drift
             for i, (cells, sign) in enumerate(((first, 1), (other, -1)))
@@ -134,7 +134,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield rows of owned mixed cells, and their k_r (k,) and slopes: see `Relative`."""
+        """Yield rows of faces at owned mixed cells, with k_r (k,) and derivatives, see `Relative.through_sides`."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -150,7 +150,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return ways of the cells at these faces, with ghosts from their owners."""
+        """Return the paths of all cells at these faces, ghosts from their owners."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
@@ -163,25 +163,21 @@ class Borders:
 
 @dataclass(frozen=True, eq=False)
 class BorderFaces:
-    """Faces between cells of different soil, with their conductivities.
-
-    borders, mobility: see `Borders.faces`; laws: see `Laws`; pair (2, m): local cells; area (m,): m^(d-1); paths,
-    lengths: see `through`; offsets: vectors (m, d), m; weight (d,), bulk: fluid's unit weight, N/m^3, and modulus, Pa.
-    """
+    """Faces between cells of different soil, with their conductivities; arrays over m faces."""
 
     borders: Borders
-    mobility: Mobility
-    laws: Any
-    pair: NDArray[np.int64]
-    area: NDArray[np.float64]
-    paths: list[Paths]
-    lengths: list[NDArray[np.float64]]
-    offsets: list[NDArray[np.float64]]
-    weight: NDArray[np.float64]
-    bulk: float
+    mobility: Mobility  # of the filled owned cells
+    laws: Any  # relative conductivities, see `Laws`
+    pair: NDArray[np.int64]  # local cells on both sides (2, m)
+    area: NDArray[np.float64]  # (m,), m^(d-1)
+    paths: list[Paths]  # flow paths on both sides, see `through`
+    lengths: list[NDArray[np.float64]]  # lengths of these paths (m,), m
+    offsets: list[NDArray[np.float64]]  # vectors along these paths for the weight of the fluid (m, d), m
+    weight: NDArray[np.float64]  # unit weight of the fluid (d,), N/m^3
+    bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at pressures (2, m) of the cells, Pa; force (c, d): its inertia force, N/m^3."""
+        """Return the fluxes at cell pressures p (2, m), Pa.  `force` (c, d), N/m^3, is the inertia force in cells."""
         weight = (
             self.weight
             if force is None
@@ -196,19 +192,19 @@ class BorderFaces:
 
 @dataclass(frozen=True)
 class BorderFlows:
-    """Fluxes through such faces; pair (2, m): local cells; flux (m,): m^d/s; slopes (m,): derivatives by pressure."""
+    """Fluxes through faces between cells of different soil; arrays over m faces."""
 
-    pair: NDArray[np.int64]
-    flux: NDArray[np.float64]
-    slopes: list[NDArray[np.float64]]
+    pair: NDArray[np.int64]  # local cells on both sides (2, m)
+    flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s
+    slopes: list[NDArray[np.float64]]  # derivatives by the pressures on both sides (m,), m^d/(Pa s)
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
-        """Add the outflows of the local cells (c,), m^d/s."""
+        """Add the fluxes to the outflows of the local cells (c,), m^d/s."""
         for cells, sign in zip(self.pair, (1, -1), strict=True):
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the derivatives of the outflows to a matrix; the caller finalises it."""
+        """Add the derivatives of the outflows to a matrix, without final assembly."""
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
-The outflow of a cell through a face is prescribed, or T r [p - p_out + rho_w g . (x_out - x)] with T = A kappa / d and
-the distance d of the cell's centroid.  A seepage face permits outflow only.  A primal-dual active set
-(Hintermueller, Ito and Kunisch 2002) opens faces with outflow, at the start of the substep and then after each
-solution (`SideFeeds.settle`).  The infiltration is the rain, at most the inflow under the pressure of its pond.
-Evaporation is at most the outflow to the driest pressure.  A pond of volume V additionally supplies V / dt in a step,
-uniformly over its side.  Infiltration, ponding and run-off sum to the rain within rounding.
+The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
+T = A kappa / d, d is the distance from the centroid of the cell's material to the face, and r is the relative density
+of the fluid.  At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch
+2002) opens faces with outflow, at the start of the substep and then after each solution (`SideFeeds.settle`).
+Infiltration is the rain, but at most the inflow at the pressure of the pond.  Evaporation is at most the outflow at the
+driest pressure.  A pond of volume V supplies V / dt in a step in addition to the rain, uniformly over its side.
+Infiltration, ponding and run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -29,31 +30,32 @@ from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 THICK = np.sqrt(2)
-"""Largest section of a cube, divided by its face.  Source: exact bound (Ball 1986).
+"""Largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
-The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face closer
-to the centroid of its cell's material, or behind it, bounds only a part of the material, and must not drain all of it.
+The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) away from the plane.  A
+face that is closer to the centroid of the cell's material, or behind it, bounds only a part of the material, and must
+not drain the whole.
 """
 
 
 class DrainedSides(Feeding):
-    """Drained sides and prescribed inflows of a stage.
+    """Drained sides, prescribed inflows and rain of a stage.
 
     Parameters
     ----------
     setting
-        Grid, materials and sides of the stage.
+        Data that all conditions of the stage share.
     outlets
-        The conditions by name.
+        Conditions by name.
 
     Raises
     ------
     ValueError
-        A condition on a side without points, or two conditions on the same faces.
+        A condition on a side without points, or two conditions on the same part of a face.
     """
 
     conditions, title = (Drained, Inflow, Rain), "open sides"
@@ -73,34 +75,34 @@ class DrainedSides(Feeding):
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces."""
+        """Faces on which the conditions act."""
         return [faces for _, faces in self._outlets]
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return outflows of this value before a first step."""
+        """Return outflows before the first step, filled with this value."""
         return {name: np.array(value) for name in self._names}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return run-offs of this value before a first step."""
+        """Return run-offs before the first step, filled with this value."""
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow, run-off and ponds before a first step: zero, or none without rain."""
+        """Return the volumes of outflow, run-off and ponds before the first step: zero, or nothing without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points at the faces."""
+        """Return the points whose domains have faces on open sides."""
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
 
     def placed(self, wet: Wet) -> SideFeeds:
-        """Return the open sides of the present cut, with their pressures and inflows at the time."""
+        """Return the flow through the open sides in a substep, with pressures and inflows at its end."""
         if self.varies:
-            return SideFeeds(self._sides(wet), wet, self._grid, self._names, self._ponds)
+            return SideFeeds(self._sides(wet), wet, self._names, self._ponds)
         key = (wet.cut.key, wet.contents.key, wet.points)
         sides = self._constant(key, lambda: self._sides(wet), self._grid.comm)
-        return SideFeeds(sides, wet, self._grid, self._names, self._ponds)
+        return SideFeeds(sides, wet, self._names, self._ponds)
 
     def _sides(self, wet: Wet) -> OpenSides:
         grid, rows = self._grid, []
@@ -122,7 +124,7 @@ class DrainedSides(Feeding):
         normal = area / size[:, None]
         distance = np.einsum("md,md->m", offset, normal)
         shape = size / np.maximum(distance, least)
-        if grid.axisymmetric:  # circumference half-way to the centroid
+        if grid.axisymmetric:  # uses the circumference half-way to the centroid
             shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
         rains = np.isfinite(driest)
@@ -132,21 +134,16 @@ class DrainedSides(Feeding):
 
 @dataclass(frozen=True)
 class OpenFaces:
-    """Faces on open sides with their conductances; arrays over m faces.
+    """Faces on open sides with their conductances; arrays over m faces."""
 
-    at (m,): index of the cell among the n active owned cells; conductance (m,): outflow per unit of the cell's mass
-    potential, m^d/(Pa s); inflow (m,): prescribed, or by the outer pressure, m^d/s; seeps (m,): face with outflow only;
-    offset (m, d): vector from the cell's centroid, m.
-    """
-
-    at: NDArray[np.int64]
-    conductance: NDArray[np.float64]
-    inflow: NDArray[np.float64]
-    seeps: NDArray[np.bool_]
-    offset: NDArray[np.float64]
+    at: NDArray[np.int64]  # index of the cell among the n active owned cells (m,)
+    conductance: NDArray[np.float64]  # outflow per unit of the cell's mass potential (m,), m^d/(Pa s)
+    inflow: NDArray[np.float64]  # inflow that is prescribed, or caused by the outside pressure (m,), m^d/s
+    seeps: NDArray[np.bool_]  # whether fluid can only leave (m,)
+    offset: NDArray[np.float64]  # vector from the centroid of the cell's material (m, d), m
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) if it were open in both directions, m^d/s."""
+        """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
@@ -158,68 +155,69 @@ class OpenFaces:
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction for a pressure difference (m,), Pa: a flow, m^d/s, and a fraction."""
+        """Return the non-orthogonal correction for pressure differences (m,), Pa.
+
+        The correction is a flow to be added, m^d/s, and a fraction of the two-point flux to be added.
+        """
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) by forces of inertia on the fluid, m^d/s."""
+        """Return the outflow through each face (m,), m^d/s, caused by inertia forces on the fluid."""
         along = np.einsum("md,md->m", fluid.force[self.at], self.offset)
         return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
 
 
 @dataclass(frozen=True)
 class UnsaturatedFaces(OpenFaces):
-    """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1.
+    """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1."""
 
-    relative: see `Relative`; cells (m,): cells behind them; normal (m, d): unit normals; outside (m,): outer pressures,
-    Pa; drop (m,): hydrostatic difference, centroid to face, Pa; outer (m,): mass potential at outside - drop.
-    """
-
-    relative: Relative
-    cells: NDArray[np.int32]
-    normal: NDArray[np.float64]
-    outer: NDArray[np.float64]
-    outside: NDArray[np.float64]
-    drop: NDArray[np.float64]
+    relative: Relative  # relative conductivities of the cells
+    cells: NDArray[np.int32]  # cells behind the faces (m,)
+    normal: NDArray[np.float64]  # unit normals (m, d)
+    outer: NDArray[np.float64]  # mass potential at the pressure outside - drop (m,), Pa
+    outside: NDArray[np.float64]  # pressure outside (m,), Pa
+    drop: NDArray[np.float64]  # hydrostatic pressure drop from the centroid to the face (m,), Pa
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) if it were open in both directions, m^d/s."""
+        """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
     def nonorthogonal(
         self, fluid: Fluid, correction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction: no flow, and a fraction of the two-point flux, in [-1, 1].
+        """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
 
-        Conductivities change by decades in a step, so the correction follows the flux; it is limited not to empty soil.
+        Conductivities change by decades in a step, so the correction must be proportional to the flux.  It is limited
+        so that it cannot empty the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
         return 0.0, np.where(self.seeps, 0.0, share)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the potential difference, m^d/(Pa s)."""
+        """Return the outflow through each face (m,) per unit of the difference of mass potentials, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow with respect to the cell's pressure, >= 0, m^d/(Pa s)."""
+        """Return the derivative of the outflow by the pressure of the cell, >= 0, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r of the faces (m,) at the cells' pressures, and the derivatives of k_r times the difference."""
+        """Return k_r of the faces (m,), and the derivative of k_r times the difference of mass potentials."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides, some with rain; rain (m,): m^d/s, nan for other faces; pond, dry: faces at both bounds.
+    """Faces on open sides, at least one with rain.
 
-    The outflow is minus the rain, limited by the outflows at the bounds.  It includes seepage, so `seeps` is false.
+    The outflow is minus the rain, but at least the outflow at the pond's pressure and at most that at the driest
+    pressure.  The outflow includes seepage, so `seeps` is False.
     """
 
-    rain: NDArray[np.float64]
-    pond: OpenFaces
-    dry: OpenFaces
+    rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
+    pond: OpenFaces  # these faces with the pressure of the pond outside
+    dry: OpenFaces  # these faces with the driest pressure outside
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
@@ -231,44 +229,42 @@ class RainedFaces(OpenFaces):
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction; zero on faces with rain."""
+        """Return the non-orthogonal correction, which is zero on faces with rain."""
         return tuple(
             np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
         )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) by forces of inertia, m^d/s; zero on faces with rain."""
+        """Return the outflow through each face (m,), m^d/s, caused by inertia forces; zero on faces with rain."""
         return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the potential difference, m^d/(Pa s)."""
+        """Return the outflow through each face (m,) per unit of the difference of mass potentials, m^d/(Pa s)."""
         return self.pond.open_by(fluid)
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow with respect to the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative of the outflow by the pressure of the cell, m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
 
 class SideFeeds(Feeds):
-    """Open sides in a substep.
+    """Flow through open sides in a substep.
 
     Parameters
     ----------
     sides
-        Their faces.
+        Faces of the open sides.
     wet
         Data of the substep.
-    grid
-        Background grid.
     names, ponds
-        Names and largest depths of ponds, m (None without rain), of the conditions, by the faces' numbers.
+        Names of the conditions, and largest pond depths, m, or None without rain; in the order of `OpenSides.number`.
     """
 
-    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):
+    def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
         self._rains = tuple(depth is not None for depth in ponds)
         self._names, self._before = names, wet.outcome
-        self._contents, self._comm = wet.contents, grid.comm
+        self._contents, self._comm = wet.contents, wet.cut.grid.comm
         self._fallen = sides.rain
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
@@ -281,9 +277,9 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return sides with the pressure and the supply of ponds over a time dt, s, and the ponds' capacities, m^d.
+        """Return sides with the pressure and water supply of ponds over a time dt (s), and the ponds' capacities, m^d.
 
-        ponds (n,): their largest depths, m.
+        `ponds` are the largest depths, m.
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
@@ -296,7 +292,7 @@ class SideFeeds(Feeds):
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
-        """Volumes of ponds at the start of the step, m^d, by number of the condition."""
+        """Volume of the pond of each condition at the start of the step, m^d."""
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
@@ -311,7 +307,7 @@ class SideFeeds(Feeds):
         return RainedFaces(*same, self.sides.rain, faces, dry)
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
-        """Return the faces for the outer pressures of `sides`."""
+        """Return the faces with the outside pressures of `sides`."""
         at = self._contents.slot(sides.cells)
         conductance, inflow = sides.driven(at, flow)
         offset = flow.deformed(at, sides.offset)
@@ -322,46 +318,46 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Open seepage faces with outflow; cell pressures decide, without the correction."""
+        """See `Feeds`.  Seepage faces with outflow open; uncorrected cell pressures decide."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells; the non-orthogonal correction is taken at the start of the substep."""
+        """Return the outflow of the cells.  The non-orthogonal correction is that at the start of the substep."""
         flux, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
         rows = np.array([flux, counts * at.open_by(fluid), np.abs(flux) * self._drain])
         cells, turnover, gain = sum_by(at.at, rows, len(fluid.pi))
-        return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # steady rain changes nothing: it has no gain
+        return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # rain is no gain: steady rain changes no storage
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow."""
+        """Return the derivative of the outflow by the pressure of the cell."""
         return sum_by(at.at, self._counts(at) * (1 + self._share) * at.derivative(fluid), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
-        """Open seepage faces with outflow and close the others; return the number of changes."""
+        """Open seepage faces with outflow, and close the other seepage faces; return the number of changes."""
         flows = at.outflow(fluid) > 0
         changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
         self._flows = flows
         return changes
 
     def outflows(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow through the sides of each condition, m^d/s, by name."""
+        """Return the outflow through the sides of each condition, m^d/s, by name of the condition."""
         sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name of the rain."""
+        """Return the rain that does not infiltrate, m^d/s, by name of the condition."""
         if not any(self._rains):
             return {}
-        excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
+        excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
         runs = over_all(self._comm, sum_by(self.sides.number, excess, len(self._names)))
-        runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # a pond feeds the soil as well
+        runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # the pond also supplies the soil
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow through the sides of each condition, and the rain on them (2,), m^d/s."""
+        """Return the outflow through the sides of each condition, and the rain on these sides, (2,), m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
@@ -371,7 +367,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow through sides, run-off and ponds, m^d."""
+        """Return the volumes of outflow, run-off and ponded water, m^d."""
         if not any(self._rains):
             return {}
         flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Protocol of the conditions on the pore fluid: drained sides, inflows, sources.
+"""Interface of the conditions on the pore fluid: drained sides, inflows, rain, sources.
 
-A new condition needs a method `feeding(setting)` that returns a `Feeding`.  `Feeding` is made once a stage, and finds
-its faces.  `Feeding.placed` is called once a substep, and returns `Feeds`.  These add to the outflow of the cells in
-each assembly of the residual.  `conditions/acting.py` is the same protocol for the momentum.
+The method `feeding(setting)` of a condition returns a `Feeding`, which is created once in a stage and holds the faces.
+`Feeding.placed` returns the `Feeds` of a substep.  At each assembly of the residual, `Feeds` add flow rates to the
+outflow of the cells.  `conditions/acting.py` has the same interface for the momentum balance.
 """
 
 from __future__ import annotations
@@ -23,71 +23,62 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Wet(NamedTuple):
-    """Data of a substep for conditions on the fluid.
+    """Data that the conditions on the fluid need in a substep."""
 
-    cut: cut domains; points: points at present positions; contents: see `CellContents`; pieces: quadrature points, None
-    if only open sides are needed; t: end of the substep, s; drains: whether pores drain under suction; dt: length of
-    the step, s; outcome: outcome of the last step.
-    """
-
-    cut: CutDomains
-    points: MaterialPoints
-    contents: CellContents
-    t: float
-    pieces: PointData | None = None
-    drains: bool = False
-    dt: float = np.inf
+    cut: CutDomains  # particle domains cut by the grid
+    points: MaterialPoints  # material points at their current positions
+    contents: CellContents  # material in the cells
+    t: float  # end of the substep, s
+    pieces: PointData | None = None  # quadrature points; None if only open sides are needed
+    drains: bool = False  # whether pores drain under suction
+    dt: float = np.inf  # length of the step, s
+    # results of the conditions in the previous step
     outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
 
 
 class Fluid(NamedTuple):
-    """Fluid in the active owned cells: pressures p and mass potentials pi (n,), Pa; relative density (n,).
+    """Fluid in the n active owned cells."""
 
-    The density is relative to its value at zero pressure.  force (n, d): inertia force, N/m^3, or None.
-    """
-
-    p: NDArray[np.float64]
-    pi: NDArray[np.float64]
-    density: NDArray[np.float64]
-    force: NDArray[np.float64] | None = None
+    p: NDArray[np.float64]  # pressure (n,), Pa
+    pi: NDArray[np.float64]  # mass potential (n,), Pa
+    density: NDArray[np.float64]  # density divided by the density at zero pressure (n,)
+    force: NDArray[np.float64] | None = None  # inertia force on the fluid (n, d), N/m^3
 
 
 class Leaving(NamedTuple):
-    """Outflow of the active owned cells (n,), m^d/s; turnover: absolute flows; gain: absolute sources.
+    """Outflow from the n active owned cells by a condition, m^d/s."""
 
-    The turnover scales rounding errors, the gain scales the balance.
-    """
-
-    cells: NDArray[np.float64]
-    turnover: NDArray[np.float64] | float = 0.0
-    gain: NDArray[np.float64] | float = 0.0
+    cells: NDArray[np.float64]  # outflow (n,)
+    turnover: NDArray[np.float64] | float = 0.0  # sum of absolute flows, the scale of rounding errors
+    gain: NDArray[np.float64] | float = 0.0  # absolute value of sources, which scales the fluid balance
 
 
 class Feeds:
-    """Effect of a condition on the fluid of the cells in a substep; the defaults have no effect.
+    """Flow rates of the conditions of one kind in a substep.  A method that is not overridden adds nothing.
 
-    Arrays are over the n active owned cells.  `at` is the result of `conducting` for the present displacements.
+    Arrays have one entry for each of the n active owned cells.  `at` is the result of `conducting` for the current
+    displacements.
     """
 
     linear: bool = True
-    """Whether the outflow is always linear in the mass potentials."""
+    """Whether the outflow is always a linear function of the mass potentials."""
     settles: bool = False
-    """Whether it has an active set, see `settle`."""
+    """Whether the condition has an active set, see `settle`."""
     sides: OpenSides | None = None
-    """Faces with an outer pressure or a flux."""
+    """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of the cells; cached until these change."""
+        """Return data that depend on conductivities and motion of the cells.  They are stored until these change."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Begin a substep; difference (m,), Pa: correction of the cell pressure at `sides`, see `nonorthogonal`."""
+        """Start a substep.  `difference` (m,), Pa, corrects cell pressures at `sides`, see `nonorthogonal`."""
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells."""
+        """Return the outflow from the cells."""
         raise NotImplementedError
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
-        """Return the derivative (n,) of the outflow with respect to the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative (n,) of the outflow by the pressure of the cell, m^d/(Pa s)."""
         return 0.0
 
     def settle(self, at: Any, fluid: Fluid) -> int:
@@ -95,23 +86,23 @@ class Feeds:
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies by each condition, m^d/s, by name; a collective call."""
+        """Return the outflow from the bodies through each condition, m^d/s, by name; all processes must call this."""
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name; a collective call."""
+        """Return the rain that does not infiltrate, m^d/s, by condition; all processes must call this."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates of a substep for `volumes`, by name; a collective call."""
+        """Return the rates of a substep from which `volumes` are computed; all processes must call this."""
         return {}
 
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes since the conditions began, m^d, by quantity and name, after a step.
+        """Return volumes since the conditions began, m^d, by quantity and condition, after a step.
 
-        rates: rates in its substeps, see `passing`; seconds: time weights of these substeps, s.
+        `rates` are the results of `passing` in the substeps, `seconds` the time weights of the substeps, s.
         """
         return {}
 
@@ -122,35 +113,35 @@ def open_sides(feeds: Sequence[Feeds], dim: int) -> OpenSides:
 
 
 class Feeding:
-    """The conditions of one kind in a stage."""
+    """All conditions of one kind in a stage."""
 
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""
     title: ClassVar[str] = "user-defined conditions"
-    """Their name in the summary of a scene."""
+    """Name of this kind in the summary of a scene."""
     count: int = 0
     """Number of conditions."""
     varies: bool = False
-    """Whether pressures or fluxes change with time or position."""
+    """Whether pressures or fluxes depend on time or position."""
     surfaces: Sequence[Surface] = ()
-    """Faces on which they act."""
+    """Faces on which the conditions act."""
 
     def placed(self, wet: Wet) -> Feeds:
-        """Return the effect of the conditions in a substep."""
+        """Return the flow rates of the conditions in a substep."""
         raise NotImplementedError
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return points, with repetitions, of bodies that may gain or lose fluid."""
+        """Return the points, with repetitions, at which bodies may gain or lose fluid."""
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return `Feeds.outflows` of this value, before a first step."""
+        """Return the result of `Feeds.outflows` before the first step, filled with this value."""
         return {}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return `Feeds.run_off` of this value, before a first step."""
+        """Return the result of `Feeds.run_off` before the first step, filled with this value."""
         return {}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return `Feeds.volumes` before a first step."""
+        """Return the result of `Feeds.volumes` before the first step."""
         return {}

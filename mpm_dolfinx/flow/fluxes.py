@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Two-point fluxes of the pore fluid through the covered parts of cell faces, and their damping.
+"""Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
 
-The contents of the cells are coefficients of the forms, set at each grid reset.  In a moving body the fluxes through
-the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the material in a
-cell, its mobility kappa becomes J F^-1 kappa F^-T.  Fluxes through open sides are in `drained_sides`; `StorageProblem`
-in `storage` sums both.
+The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
+fluxes through the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the
+material in a cell, its mobility kappa becomes J F^-1 kappa F^-T.  `drained_sides` computes fluxes through open sides;
+`StorageProblem` in `storage` adds up both kinds of fluxes.
 """
 
 from __future__ import annotations
@@ -30,57 +30,48 @@ from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
-ALONG = 0.1  # component of a unit normal: sides with less do not determine the pressure's slope along that axis
+ALONG = 0.1  # smallest component of the unit normal along an axis, if a side determines the slope along it
 
 
 @dataclass(frozen=True)
 class Mobility:
-    """Mobility of the filled owned cells.
+    """Mobility of the n filled owned cells.  In unsaturated soil, `mean` and `share` refer to saturated pores."""
 
-    mean (n,): mean of the pieces, m^2/(Pa s); share (n, d): mobility along each axis / mean; shift (n, d): vector, m,
-    from the centroid to the position of the cell's pressure.  The last two are None without mixed cells.  In
-    unsaturated soil mean and share refer to saturated pores.  shares (n, k): fractions of the mean from soil without a
-    retention curve and from each curve; paths: flow paths of mixed cells, see `series`; borders: faces between cells of
-    different soil.
-    """
-
-    mean: NDArray[np.float64]
-    share: NDArray[np.float64] | None = None
+    mean: NDArray[np.float64]  # mean over the pieces (n,), m^2/(Pa s)
+    share: NDArray[np.float64] | None = None  # (mobility along each axis) / mean (n, d); None without mixed cells
+    # vector from the centroid to the pressure position of the cell (n, d), m; None without mixed cells
     shift: NDArray[np.float64] | None = None
+    # fractions of the mean from soil without a retention curve, and from each curve (n, k)
     shares: NDArray[np.float64] | None = None
-    paths: Any = None
-    borders: Any = None
+    paths: Any = None  # flow paths of mixed cells, see `series`
+    borders: Any = None  # faces between cells of different soil
 
 
 class CellMotion(NamedTuple):
-    """Motion of n cells in a step: F (n, d, d), displacement (n, d), m; circumferential stretch (n,) or None."""
+    """Motion of n cells in a step."""
 
-    F: NDArray[np.float64]
-    moved: NDArray[np.float64]
-    hoop: NDArray[np.float64] | None
+    F: NDArray[np.float64]  # deformation gradient (n, d, d)
+    moved: NDArray[np.float64]  # displacement (n, d), m
+    hoop: NDArray[np.float64] | None  # circumferential stretch (n,); None unless axisymmetric
 
 
 @dataclass(frozen=True)
 class Conduction:
-    """Conductivity and motion of the filled owned cells.
-
-    motion: motion of the centroids in the step, None for bodies nearly at rest; weight (d,): unit weight of the fluid,
-    N/m^3, None without gravity; bulk: bulk modulus of the fluid, Pa; relative: see `unsaturated.Relative`.
-    """
+    """Conductivity and motion of the filled owned cells."""
 
     mobility: Mobility
-    motion: CellMotion | None
-    weight: NDArray[np.float64] | None
-    bulk: float
-    relative: Any = None
+    motion: CellMotion | None  # motion of the centroids in the step; None for bodies that hardly move
+    weight: NDArray[np.float64] | None  # unit weight of the fluid (d,), N/m^3; None without gravity
+    bulk: float  # bulk modulus of the fluid, Pa
+    relative: Any = None  # relative conductivities, see `unsaturated.Relative`
 
     @cached_property
     def _cofactors(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Cofactors (n, d, d) and determinants (n,) of the cells' F."""
+        """Cofactors (n, d, d) and determinants (n,) of F of the cells."""
         return cofactor(self.motion.F), determinant(self.motion.F)
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the mobilities (n, d) along the axes, pulled back: `across` for all unit vectors."""
+        """Return the mobilities (n, d) along the axes, pulled back to the start of the step."""
         kappa, share = self.mobility.mean[:, None], self.mobility.share
         kappa = kappa.repeat(dim, axis=1) if share is None else kappa * share
         if self.motion is None:
@@ -90,7 +81,7 @@ class Conduction:
         return along if hoop is None else along * hoop[:, None]
 
     def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mobilities (m,) of some cells along normals (m, d), pulled back: n . J F^-1 kappa F^-T n."""
+        """Return the mobilities (m,) of cells `at` along normals n (m, d), pulled back: n . J F^-1 kappa F^-T n."""
         kappa, share = self.mobility.mean[at], self.mobility.share
         if share is not None:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
@@ -104,7 +95,7 @@ class Conduction:
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
         """Return (distance of centroid) / (distance of pressure position) from faces (m,), along normals (m, d).
 
-        offset (m, d): vectors from the centroids to the faces, m.
+        `offset` (m, d), m, are the vectors from the centroids to the faces.
         """
         if self.mobility.shift is None:
             return 1.0
@@ -113,34 +104,28 @@ class Conduction:
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the deformed vectors (m, d), m, in cells `at`."""
+        """Return vectors (m, d), m, in cells `at` after the deformation F of the cells."""
         return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 
 @dataclass(frozen=True)
 class OpenSides:
-    """Open sides of the bodies; arrays over m faces.
+    """Open sides of the bodies; arrays over m faces.  Each face belongs to one owned cell."""
 
-    number (m,): condition; cells (m,): owned cell behind each face; shape: area / (distance to the cell's centroid),
-    m^(d-2), zero for a prescribed inflow; pressure: outer pressure, Pa; given: prescribed inflow, m^d/s; seeps: face
-    with outflow only; area (m, d): outward area vector, m^(d-1); offset (m, d): vector from the cell's centroid, m;
-    rain (m,): m^d/s; driest (m,): lowest outer pressure, Pa; both nan without rain.
-    """
-
-    number: NDArray[np.int64]
-    cells: NDArray[np.int32]
-    shape: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    given: NDArray[np.float64]
-    seeps: NDArray[np.bool_]
-    area: NDArray[np.float64]
-    offset: NDArray[np.float64]
-    rain: NDArray[np.float64]
-    driest: NDArray[np.float64]
+    number: NDArray[np.int64]  # number of the condition (m,)
+    cells: NDArray[np.int32]  # cell behind the face (m,)
+    shape: NDArray[np.float64]  # area / (distance to the cell's centroid), 0 for a prescribed inflow (m,), m^(d-2)
+    pressure: NDArray[np.float64]  # pressure outside (m,), Pa
+    given: NDArray[np.float64]  # prescribed inflow (m,), m^d/s
+    seeps: NDArray[np.bool_]  # whether fluid can only leave (m,)
+    area: NDArray[np.float64]  # outward area vector (m, d), m^(d-1)
+    offset: NDArray[np.float64]  # vector from the cell's centroid to the face (m, d), m
+    rain: NDArray[np.float64]  # rain (m,), m^d/s; nan without rain
+    driest: NDArray[np.float64]  # lowest pressure outside (m,), Pa; nan without rain
 
     @classmethod
     def joined(cls, several: Sequence[OpenSides], dim: int) -> OpenSides:
-        """Return the concatenated faces of several open sides."""
+        """Return the faces of several open sides as one object."""
         if len(several) == 1:
             return several[0]
         none, vectors = np.empty(0), np.empty((0, dim))
@@ -150,32 +135,33 @@ class OpenSides:
 
     @cached_property
     def normal(self) -> NDArray[np.float64]:
-        """Unit vectors (m, d)."""
+        """Outward unit normals (m, d)."""
         return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
 
-        The inflow is prescribed, or due to outer pressure and gravity; at (m,): index of the cells among filled ones.
+        The inflow is prescribed, or caused by the outside pressure and gravity.  `at` (m,) are the indices of the cells
+        among the filled cells.
         """
         shape = self.shape * flow.distance_ratio(at, self.normal, self.offset)
         conductance = flow.across(at, self.normal) * shape
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the outer mass potentials (m,), less the weight of the fluid up to the faces, Pa."""
+        """Return the mass potentials (m,), Pa, of the outside pressure minus the fluid's weight up to the faces."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pressure differences, Pa, and slopes, Pa/m, to drained sides (n, d, 2, 2), by axis and end of a cell.
 
-        They are nan without a drained side.
+        The values are nan where there is no drained side.
 
         Parameters
         ----------
         at : (m,)
-            Index of the faces' cells among the filled ones.
+            Index of the cell of each face among the filled cells.
         p : (n,), Pa
             Pressures of the filled cells.
         """
@@ -193,7 +179,7 @@ class OpenSides:
         slots = (ends * at[:, None] + np.arange(ends)).ravel()
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return the sums of values by cell, axis and end."""
+            """Return the sums of values for each cell, axis and end."""
             return sum_by(slots, values.ravel(), ends * len(p)).reshape(out.shape[:3])
 
         whole = total(share)
@@ -205,29 +191,24 @@ class OpenSides:
 
 @dataclass(frozen=True)
 class PieceContents:
-    """Contributions of pieces to their owned cells; arrays over m pieces.
+    """Contributions of pieces to their owned cells; arrays over m pieces."""
 
-    cells (m,); weight: volume, m^d; area, x (m, d): volume and centroid, m, in axisymmetry of the section; faces (m, d,
-    2): areas on the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa; damping: the
-    strength tau of the damping of pressure jumps, 1/Pa.
-    """
-
-    cells: NDArray[np.int32]
-    weight: NDArray[np.float64]
-    area: NDArray[np.float64]
-    x: NDArray[np.float64]
-    faces: NDArray[np.float64]
-    fixed_stress: NDArray[np.float64]
-    damping: NDArray[np.float64]
+    cells: NDArray[np.int32]  # owned cell (m,)
+    weight: NDArray[np.float64]  # volume (m,), m^d
+    area: NDArray[np.float64]  # volume (m,), m^d; in axisymmetry area of the section, m^2
+    x: NDArray[np.float64]  # centroid (m, d), m; in axisymmetry of the section
+    faces: NDArray[np.float64]  # areas on the lower and upper faces of the cell (m, d, 2), m^(d-1)
+    fixed_stress: NDArray[np.float64]  # fixed-stress coefficient beta (m,), 1/Pa
+    damping: NDArray[np.float64]  # strength tau of the damping of pressure jumps (m,), 1/Pa
 
 
 class CellContents(Keyed):
-    """Contents of the cells since the grid reset; local arrays are valid at active cells.
+    """Material in the cells, as of the last grid reset.  Arrays over local cells are valid in active cells.
 
     Parameters
     ----------
     forms
-        The forms; their coefficients are set.
+        Forms whose coefficients are set.
     pieces
         Contributions of the pieces.
     filled
@@ -237,19 +218,19 @@ class CellContents(Keyed):
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
         self.grid = grid = forms.grid
         self.active = active = forms.active.now.cells
-        """Owned active cells and active ghosts."""
+        """Owned active cells and active ghost cells."""
         self.filled, self._nodes = filled, grid.cell_nodes[filled]
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, m^d; in axisymmetry, areas (m,) of their sections, m^2."""
+        """Volumes (m,) of the pieces, m^d; and in axisymmetry areas (m,) of their sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of material in the filled cells, m^d, and the fixed-stress coefficient times volume."""
+        """Volumes (n,) of the material in filled cells, m^d; and the fixed-stress coefficient times the volume."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
-        """Volume fraction of material in the filled cells."""
+        """Volume fractions of material in the filled cells (n,)."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
         forms.fixed_stress.x.array[filled] = self.fixed_stress
@@ -264,14 +245,14 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active] = np.stack([lower[active], upper[active]], axis=2)
-        """Vectors (c, d), m, from cells' midpoints to their material's centroids; open fractions (c, d, 2) of faces."""
+        """Vectors (c, d), m, from cell midpoints to centroids of material; open fractions (c, d, 2) of faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
         return sum_by(self._at, values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the softness of the filled cells: the largest softness (m,) of their pieces."""
+        """Return the largest softness of the pieces (m,) in each filled cell."""
         softest = np.ones(len(self.filled))
         np.maximum.at(softest, self._at, softness)
         return softest
@@ -279,9 +260,9 @@ class CellContents(Keyed):
     def set_damping(
         self, share: NDArray[np.float64] | float = 1.0, less: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa.
+        """Set the strength tau of the damping of elastic soil in the filled cells; return tau (n,), 1/Pa.
 
-        share (n,): factor of tau; less (n,): storage by saturation, 1/Pa, subtracted from it.
+        `share` (n,) multiplies tau.  `less` (n,), 1/Pa, is the storage by saturation, which is subtracted.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values
@@ -289,15 +270,15 @@ class CellContents(Keyed):
         return values
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means over the pieces (m,) of each filled cell."""
+        """Return the means (n,) over the pieces (m,) of each filled cell, weighted by volume."""
         return self.total(self.weight * values) / self.volume
 
     def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return u (nodes, d) at the nodes of the filled cells (n, d, 2^d)."""
+        """Return nodal values u (nodes, d) at the nodes of the filled cells, as an array (n, d, 2^d)."""
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at their centroids by `nodal` displacements, m; rests: cells at rest."""
+        """Return the motion of filled cells at their centroids, for displacements `nodal`, m; `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = np.eye(d) + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
@@ -311,35 +292,35 @@ class CellContents(Keyed):
 
     @property
     def shape_values(self) -> NDArray[np.float64]:
-        """Values (n, 2^d) of the shape functions at the centroids of the material in filled cells."""
+        """Values (n, 2^d) of the shape functions at the centroids of material in filled cells."""
         return self._shapes[:, :, -1]
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the indices of cells among the filled cells."""
+        """Return the index of each cell among the filled cells."""
         return self._slot[cells]
 
 
 class FluxForms:
-    """The forms over the faces between active cells, and their coefficients.
+    """Compiled forms over the faces between active cells, and their coefficients.
 
     Parameters
     ----------
     grid
         Background grid.
     active
-        Its active part.
+        Active part of the grid.
     weight : (d,), N/m^3
-        Weight of the pore fluid rho_w g as UFL, None without gravity.
+        Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     flows
-        Whether any material conducts; otherwise there are no fluxes.
+        Whether any material is permeable; if not, there are no fluxes.
     pressure
-        DG0 pore pressure, Pa.
+        Pore pressure of the cells (DG0), Pa.
     bulk
         Bulk modulus of the fluid, Pa.
     inertial : (d,), N/m^3
-        Force of inertia on the pore fluid as UFL, None without.
+        Inertia force on the pore fluid, as UFL; None without inertia.
     relative
-        Conductivities by pressures in unsaturated soil, see `unsaturated`, or None.
+        Relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
     def __init__(
@@ -367,7 +348,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Covered fraction of the face, times `Grid.around`, in the direction sign * n0."""
+            """Covered fraction of the face in the direction sign * n0, in axisymmetry times `Grid.around`."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -381,7 +362,7 @@ class FluxForms:
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
         offset = across * n0 - ufl.jump(self.centroid + self.moved)
         if inertial is not None:
-            # mean over two cells like the mass, with a sixth of each neighbouring node.  With the value at the face,
+            # mean over two cells as for the mass, with a sixth of each neighbouring node.  With the value at the face,
             # freely flowing water would have more mass than all of the soil in modes that alternate between nodes
             along_n = [ufl.dot(ufl.grad(inertial)(side), n0) for side in "+-"]
             if grid.even:
@@ -402,10 +383,10 @@ class FluxForms:
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
         if grid.even:
-            volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
+            volume = fem.Constant(mesh, grid.cell_volume)  # as a number, each value would be compiled again
         else:
             h = grid.edge_in_forms()("+")
-            volume = prod(h[a] for a in range(d))  # over h0 it is the area of the face, on both sides
+            volume = prod(h[a] for a in range(d))  # divided by h0, this is the area of the face on both sides
         self.alternation = FacetForm(smaller / (4 * d) * h0 / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         self.slope = fem.Function(grid.cellwise((d,)))
         self.density = fem.Function(Q)
@@ -420,8 +401,8 @@ class FluxForms:
             )
         self.gravity = None
         if (weight is not None or relative is not None) and flows:
-            # water at rest stays at rest: its pressure grows by its weight at zero pressure.  Both are in one form, so
-            # rounding errors are conservative, and those of small differences
+            # still water must not flow: its pressure increases with depth by the weight at zero pressure.  Pressure
+            # and weight are in one form, so that rounding errors are small and conserve mass
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
             difference = ufl.jump(pressure) + drop
             flux = T * density * difference * ufl.jump(q) * dS
@@ -429,12 +410,12 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return dT / dk_r of a law, without squares of conductivities, which would vanish."""
+                    """Return dT / dk_r of a law, without squares of conductivities, which would underflow."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )
 
-                # the outflow of a cell rises with its pressure, and falls with the neighbour's, also with rounding
+                # the outflow must rise with the pressure of the cell, and fall with the neighbour's, despite rounding
                 own, other = (
                     T * sign + difference * sum(by_k(one.k) * one.slopes[side] for one in between)
                     for side, sign in enumerate((1, -1))
@@ -450,9 +431,10 @@ class FluxForms:
         active: NDArray[np.int64],
         density: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the outflow of the local cells, m^d/s, for gradients (n, d), Pa/m, in `cells`, through `facets`.
+        """Return the outflow of the local cells, m^d/s, through `facets`, caused by gradients in `cells`.
 
-        active, density: active local cells (c,), and their fluid density (c,) over the density at zero pressure.
+        `slope` (n, d), Pa/m, are the gradients.  `active` (c,) are the active local cells; `density` (c,) is the
+        density of their fluid, divided by the density at zero pressure.
         """
         self.density.x.array[active] = density
         self._sum.x.array[active] = 0.0
@@ -464,7 +446,7 @@ class FluxForms:
         return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
-        """Set the coefficients for the conductivities of filled owned cells; return their mobilities (n, d) by axis."""
+        """Set the coefficients for conductivities of filled owned cells; return mobilities (n, d) along the axes."""
         d = self.grid.dim
         filled = contents.filled
         shift = flow.mobility.shift
@@ -472,7 +454,7 @@ class FluxForms:
         if self.relative is not None:
             self.relative.set_shares(filled, flow.mobility.shares)
         values = [(self.mobility, mobility)]
-        if shift is not None:  # the fluid's weight still refers to the centroids
+        if shift is not None:  # the weight of the fluid still refers to the centroids
             values.append((self.centroid, contents.centroid[filled] + shift))
         if self.gravity:
             moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Mobility of cells with several conductivities, from lines through the cell along each axis.
 
-Soils along a line are in series; lines are in parallel.  The mobility along an axis is the mean over lines of their
-harmonic means (Cardwell and Parsons 1945).  It is exact for any number of layers along the grid, in both directions.
-Inclined layers need a thickness of a cell: a seam is then a barrier for all lines of some cell, and a drain contains
-complete lines.
+Soils along a line are in series; lines are in parallel.  The mobility along an axis is the mean, over the lines, of the
+harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exact for any number of layers parallel to
+the grid, for flow along and across them.  Inclined layers must be at least a cell thick: only then does a seam bar all
+lines of some cell, and does a drain contain complete lines.
 
-The position of a cell's pressure is the point where steady flow along a line has its mean pressure.  The resistance to
-the lower end is int (1 - s) dR, to the upper end int s dR, s in [0, 1] along the line.  Their sum over faces is exact.
-For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a drain would be
-interrupted between rows of cells.  The shape of a piece is approximated by its domain's bounding box in the cell.
+The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  With
+s in [0, 1] along the line, the resistance to the lower end is int (1 - s) dR, to the upper end int s dR.  The sum
+of these resistances over all faces of a line is exact.  For layers inclined by more than `INCLINED` the position moves
+to the more conductive end.  Otherwise a drain would be interrupted between rows of cells.  The shape of a piece is
+approximated by the bounding box of its domain in the cell.
 
-A conductivity that depends on deformation varies within a cell without layers: see `graded`.
+A conductivity that depends on deformation varies within a cell without layers, see `graded`.
 """
 
 from __future__ import annotations
@@ -30,48 +31,44 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""Inclination of layers above which a cell's pressure position moves to its most conductive part.
+"""Inclination of layers above which the pressure position of a cell moves to the most conductive part.
 
-Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03 (relative changes of the result).
+Sensitivity (slope scene): half the value changes the result by 4.1e-04, twice by 5.0e-05, finer cells by 3.4e-03.
 """
 PAIRS = 2**16
-"""Pairs of pieces in a chunk."""
+"""Number of pairs of pieces that are processed together."""
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a crossed piece.
+    """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a piece that it crosses."""
 
-    line, piece: indices among the pieces of mixed cells; length: length in the piece, cells; before: fraction of its
-    resistance between the lower end and the position of mean pressure; total: length of each whole line, cells.
-    """
-
-    line: NDArray[np.int64]
-    piece: NDArray[np.int64]
-    length: NDArray[np.float64]
-    before: NDArray[np.float64]
-    total: NDArray[np.float64]
+    line: NDArray[np.int64]  # index of the piece at whose centroid the line is drawn, among pieces of mixed cells
+    piece: NDArray[np.int64]  # index of the crossed piece
+    length: NDArray[np.float64]  # length in the crossed piece, cells
+    before: NDArray[np.float64]  # fraction of the piece's resistance below the position of mean pressure
+    total: NDArray[np.float64]  # length of the whole line, cells
 
 
 class MixedCells:
-    """Owned cells with several conductivities, and lines through them.
+    """Owned cells with several conductivities (mixed cells), and lines through them.
 
     Parameters
     ----------
     rows
-        Pieces (m,) in mixed cells, ordered by cell.
+        Indices of the pieces (m,) in mixed cells, ordered by cell.
     cells
         Cells (m,) of the pieces.
     low, high
-        Corners (m, d) of the pieces' bounding boxes in the cell, whose edge is 1.
+        Corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
     x
-        Centroids (m, d) of the pieces in the cell.
+        Centroids (m, d) of the pieces, in cell coordinates.
     volume
         Volumes (m,) of the pieces, m^d.
     contents
-        Contents of the cells.
+        Material in the cells.
     soils
-        Rows (m, k) that are equal for pieces of equal conductivity.
+        Numbers (m, k) that are equal for pieces of equal conductivity.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -82,7 +79,7 @@ class MixedCells:
         own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
         self._h = contents.grid.sizes(own)
         self.cells = own
-        """The cells."""
+        """The mixed cells."""
         self._filled, self._middle = contents.slot(own), contents.centroid[own] / self._h
         middle = self._middle
         self._bounds = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
@@ -99,16 +96,20 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return, for each axis, lines of some pieces, the pieces that they cross, and the fraction crossed.
+        """Return, for each axis, lines through some pieces, the pieces that they cross, and the fraction crossed.
 
-        first, count (m,): index of the first piece, and number of pieces, in each piece's cell.
+        `first` and `count` (m,) are the index of the first piece and the number of pieces in the cell of each piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
-        inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / NEAR + 0.5
+        x = self._x[line]
+        low = low[piece]
+        high = high[piece]
+        # mean over lines on both sides: a border of two pieces along a line is known only within rounding
+        inside = np.mean([(low <= near) & (near <= high) for near in (x - NEAR / 2, x + NEAR / 2)], axis=0)
         out = []
         for axis in range(self._x.shape[1]):
-            fraction = np.delete(inside, axis, axis=1).clip(0, 1).prod(axis=1)
+            fraction = np.delete(inside, axis, axis=1).prod(axis=1)
             kept = np.flatnonzero(fraction)
             out.append((line[kept], piece[kept], fraction[kept]))
         return out
@@ -120,10 +121,11 @@ class MixedCells:
         share: NDArray[np.float64] | None,
         now: NDArray[np.float64] | None = None,
     ) -> Mobility:
-        """Return the mobility of all filled cells from their means (n,) and the mobilities of all pieces, m^2/(Pa s).
+        """Return the mobility of filled cells, from means (n,) and mobilities `kappa` of all pieces, m^2/(Pa s).
 
-        share (n, d): mobility along the axes / mean, in unmixed cells, changed in place; now: mobilities of all pieces
-        at their pressures, in unsaturated soil.  The pressure is then at the centroid, unless layers are inclined.
+        `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  In
+        unsaturated soil, `now` are mobilities of all pieces at their pressures.  The pressure then refers to the
+        centroid, unless layers are inclined.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -135,9 +137,10 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes, and shifts in cells, of mixed cells (n, d); kappa: pieces' mobilities.
+        """Return mobilities along the axes, and shifts of the pressure position in cells, of mixed cells (n, d).
 
-        mean: 1 for shifts to the position of mean pressure, 0 for shifts by inclination alone.
+        `kappa` are mobilities of pieces.  If `mean` = 1, shifts lead to the position of mean pressure.  If `mean` = 0,
+        they are caused by inclined layers alone.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -166,9 +169,9 @@ class MixedCells:
         Parameters
         ----------
         kappa, law
-            Mobilities (m,), m^2/(Pa s), of all pieces when saturated, and numbers of their laws, below `laws`.
+            Mobilities (m,), m^2/(Pa s), of all pieces at saturation, and numbers of their retention curves, < `laws`.
         shift
-            Vectors (n, d), m, from the filled cells' centroids to their pressures' positions; None if all are zero.
+            Vectors (n, d), m, from the centroids of filled cells to their pressure positions; None if all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -178,10 +181,10 @@ class MixedCells:
         return Paths(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in padded))
 
     def _path(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Paths:
-        """Return the paths (n, ...) from positions (n,) in the cell along an axis to one of its ends."""
+        """Return the paths (n, ...) from positions (n,) in the cells along an axis to one end of the cell."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
-        length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part beyond the place
+        length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part between position and end
         kept = np.flatnonzero(length > SAME)
         kept = kept[np.lexsort((middle[kept], lines.line[kept]))]
         line, piece = lines.line[kept], lines.piece[kept]
@@ -219,7 +222,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the additional factor (n,) of a cell's shift for inclined layers."""
+        """Return the factor (n,) that is added to a cell's shift if its layers are inclined."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -240,19 +243,19 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return (mobility along each axis) / mean (n, d), for a mobility that varies gradually in a cell.
 
-    Along its gradient the pieces are in series, across it in parallel.  For other directions the difference of the two
-    means is distributed over the axes, by the variance of the linear variation along each.
+    Along its gradient the pieces conduct in series, across it in parallel.  For other directions, the difference of
+    both means is distributed over the axes, in proportion to the variance of a linear variation along each axis.
 
     Parameters
     ----------
     offset, kappa
-        Positions (m, d) of the pieces from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
+        Positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa s).
     mean
         Mean mobility of the filled cells (n,).
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
-    parts = []  # of the variance, by the linear change along each axis
+    parts = []  # part of the variance explained by a linear variation along each axis
     for x, least in zip(offset.T, (NEAR * contents.grid.sizes(contents.filled).T) ** 2, strict=True):
         middle, moment = contents.mean(x), contents.mean(x * kappa)
         variance = contents.mean(x**2) - middle**2
@@ -266,15 +269,15 @@ def graded(
 
 
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
-    """Return the owned cells with pieces of different conductivity, None if no process has any.
+    """Return the owned cells with pieces of different conductivity; None if no process has such cells.
 
-    soils: (m, k) rows that are equal for pieces of equal conductivity.
+    `soils` (m, k) are numbers that are equal for pieces of equal conductivity.
     """
     grid = cut.grid
     cells = cut.cells
     volume = contents.area
     some = np.zeros((grid.num_local, soils.shape[1]))
-    some[cells] = soils  # of any of the cell's pieces
+    some[cells] = soils  # numbers of any piece of the cell
     mixed = sum_by(cells, (soils != some[cells]).any(axis=1), grid.num_local) > 0
     corners = cut.points.corners
     low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Non-orthogonal correction of fluxes between cells and through open sides.
 
-The two-point flux uses the difference of two pressures as the difference across the face.  In bodies inclined to the
-grid two centroids also differ by a vector t along the face, up to half a cell.  The resulting error does not decrease
-with h.  With the gradients g of the pressure less the weight of the fluid in the cells
+The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
+inclined to the grid, the two centroids also differ by a vector t along the face, of up to half a cell.  The resulting
+error does not decrease with h.  With the gradients g, in both cells, of the pressure minus the weight of the fluid, the
+corrected flux is
 
-    Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t],
+    Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t].
 
-and through an open side p - p_out + g . t, with t along the side from the foot of the centroid.  The gradients are a
-least-squares fit to the neighbours, to the pressures of drained sides, and to zero flow across no-flow sides.  The area
-of the latter closes the surface of the material in the cell.  Linear pressures are exact.  The gradients are limited:
-corrected pressures at faces stay between the pressures of the neighbours.
+At an open side, p - p_out is replaced by p - p_out + g . t, with the vector t along the side from the foot of the
+centroid.  The gradients are a least-squares fit to the pressures of neighbours and drained sides, and to zero flow
+across no-flow sides.  The area vector of a no-flow side is the one that closes the surface of the material in the cell.
+Linear pressures are exact.  The gradients are limited: corrected pressures at faces stay between the pressures of the
+neighbours.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -26,21 +29,21 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import sum_by
 
 ALONG = 1e-4
-"""Offset along a face, in cells, below which two centroids are opposite each other."""
+"""Offset of two centroids along a face, in cells, up to which they need no correction."""
 NEAREST = 0.1
-"""Lower bound of the distance, in cells, in the weights of the least-squares fit.
+"""Lower bound, in cells, of the distances in the weights of the least-squares fit.
 
-Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03 (relative changes of the result).
+Sensitivity (slope scene): half the value changes the result by 3.0e-08, twice by 1.2e-06, finer cells by 3.4e-03.
 """
 SIDES = 2.0
-"""Total weight of a cell's open sides in its least-squares fit, divided by the weight of a neighbour.
+"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.
 
-Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03 (relative changes of the result).
+Sensitivity (slope scene): half the value changes the result by 4.8e-06, twice by 2.8e-06, finer cells by 3.4e-03.
 """
 
 
 def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the facets between two active cells with centroids that are not opposite each other."""
+    """Return the facets between two active cells whose centroids are offset along the facet."""
     grid = contents.grid
     first, other = grid.facet_cells[facets].T
     offset = contents.centroid[other] - contents.centroid[first]
@@ -50,14 +53,14 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 
 
 class Gradients:
-    """Gradients of the head in cells with centroids that are not opposite neighbours or open sides.
+    """Gradients of the head in cells that need the non-orthogonal correction: centroids offset along a face or side.
 
-    They are valid for a cut, and depend on the geometry of the sides only.
+    The object is valid for one cut, and depends only on the geometry of material and sides.
 
     Parameters
     ----------
     contents, sides
-        Contents of the cells, and open sides.
+        Material in the cells, and open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -79,9 +82,9 @@ class Gradients:
         along[:, np.arange(2 * d), towards] = 0.0
         h = grid.sizes(contents.filled)
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
-        off[at[(np.abs(tangential / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
+        off[at[_off_middle(sides, tangential / grid.sizes(sides.cells))]] = True
         self.rows = rows = np.flatnonzero(off)
-        """Indices of these cells among the filled cells."""
+        """Indices of the cells that need the correction, among the filled cells."""
         distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
         separation[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * distance
         self._own = contents.filled[rows]
@@ -96,13 +99,10 @@ class Gradients:
         self._tangential = tangential[self._faces]
         self._normal = normal[self._faces]
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
-        size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
-        at_sides = self._at[self._known]
-        weight = SIDES * size / sum_by(at_sides, size, len(rows))[at_sides]
-        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight)
+        self._contents, self._sides = contents, sides
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
-        """Return the area vectors (n, d) of no-flow sides in the filled cells, in areas of the cell's faces."""
+        """Return the area vectors (n, d) of no-flow sides in the filled cells, relative to the faces of the cell."""
         grid, share = contents.grid, contents.open[contents.filled]
         out = -(share[:, :, 1] - share[:, :, 0])
         for axis in range(grid.dim):
@@ -110,12 +110,13 @@ class Gradients:
             out[:, axis] -= area * grid.along(contents.filled, axis) / grid.volumes(contents.filled)
         return np.where(np.linalg.norm(out, axis=1, keepdims=True) > ALONG, out, 0.0)
 
-    def _units(
-        self, sealed: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the gradients for unit differences to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
+    @cached_property
+    def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gradients (n, 2 d, d) and (m, d), 1/m, for a unit difference to one neighbour or to one side."""
         known, d = self._known, self._separation.shape[2]
-        at = self._at[known]
+        at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
+        size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
+        weight = SIDES * size / sum_by(at, size, len(self.rows))[at]
         offset = self._offset[known]
         near = np.broadcast_to((NEAREST * self._grid.sizes(self._own).min(axis=-1)) ** 2, len(self._own))
         squared = np.maximum((self._separation**2).sum(axis=2), near[:, None])
@@ -133,7 +134,7 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the gradients (rows, d), Pa/m, of the pressure less the weight of the fluid.
+        """Return the gradients (rows, d), Pa/m, of the pressure minus the weight of the fluid.
 
         Parameters
         ----------
@@ -142,55 +143,70 @@ class Gradients:
         outer : (m,), Pa
             Pressures outside the open sides.
         weight : (d,), N/m^3
-            Unit weight of the fluid, None without gravity.
+            Unit weight of the fluid; None without gravity.
         """
+        of_cells, of_sides = self._units
         own, at = p[self._own], self._at[self._known]
         to_cells = p[self._neighbours] - own[:, None]
         to_sides = outer[self._faces[self._known]] - own[at]
         if weight is not None:
             to_cells, to_sides = to_cells - self._separation @ weight, to_sides - self._offset[self._known] @ weight
         to_cells = np.where(self._inside, to_cells, 0.0)
-        out = np.einsum("nk,nki->ni", to_cells, self._of_cells)
+        out = np.einsum("nk,nki->ni", to_cells, of_cells)
         for axis in range(out.shape[1]):
-            out[:, axis] += sum_by(at, to_sides * self._of_sides[:, axis], len(out))
+            out[:, axis] += sum_by(at, to_sides * of_sides[:, axis], len(out))
         low, high = to_cells.min(axis=1, initial=0.0), to_cells.max(axis=1, initial=0.0)
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
         increment = np.einsum("nd,nkd->nk", out, self._along)
-        share, slack = np.ones(len(out)), NEAR * (high - low)  # tolerance for uniform pressures
+        share, slack = np.ones(len(out)), NEAR * (high - low)  # allows rounding of nearly uniform pressures
         for bound, most in ((-low, -increment.min(axis=1)), (high, increment.max(axis=1))):
             bound = bound + slack
             share = np.minimum(share, np.divide(bound, most, out=np.ones(len(out)), where=most > bound))
         return out * share[:, None]
 
     def through_sides(self, slope: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-        """Return the correction of the cell pressure at open faces (count,), Pa."""
+        """Return the correction of the cell pressure at each open face (count,), Pa."""
         out = np.zeros(count)
         out[self._faces] = np.einsum("md,md->m", self._tangential, slope[self._at])
         return out
 
 
 class NonorthogonalFlow(NamedTuple):
-    """Non-orthogonal correction of the two-point fluxes.
-
-    forms, facets: forms over these faces, see `nonorthogonal_facets`; gradients: see `Gradients`; contents, sides:
-    contents of the cells, open sides; weight (d,): unit weight of the fluid, N/m^3, None without gravity.
-    """
+    """Non-orthogonal correction of the two-point fluxes."""
 
     forms: FluxForms
-    facets: FacetSum
+    facets: FacetSum  # form over the faces of `nonorthogonal_facets`
     gradients: Gradients
-    contents: CellContents
-    sides: OpenSides
-    weight: NDArray[np.float64] | None
+    contents: CellContents  # material in the cells
+    sides: OpenSides  # open sides of the bodies
+    weight: NDArray[np.float64] | None  # unit weight of the fluid (d,), N/m^3; None without gravity
 
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the additional outflow (n,), m^d/s, of the filled cells to others, and corrections (m,), Pa.
+        """Return the additional outflow (n,), m^d/s, from filled cells to others, and corrections (m,), Pa, at sides.
 
-        The latter correct the cell pressure at open sides; p (c,): local pressures, Pa; bulk: fluid's bulk modulus, Pa.
+        The corrections apply to the cell pressure at open sides.  `p` (c,), Pa, are the pressures of the local cells;
+        `bulk`, Pa, is the bulk modulus of the fluid.
         """
-        slope = self.gradients(p, self.sides.pressure, self.weight)
         filled, active = self.contents.filled, self.contents.active
+        if not self.facets.some and not len(self.gradients.rows):
+            return np.zeros(len(filled)), np.zeros(len(self.sides.cells))
+        slope = self.gradients(p, self.sides.pressure, self.weight)
+        through = self.gradients.through_sides(slope, len(self.sides.cells))
+        if not self.facets.some:
+            return np.zeros(len(filled)), through
         density = np.exp(p[active] / bulk)
         outflow = self.forms.along(slope, filled[self.gradients.rows], self.facets, active, density)
-        return outflow[filled], self.gradients.through_sides(slope, len(self.sides.cells))
+        return outflow[filled], through
+
+
+def _off_middle(sides: OpenSides, off: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for each face (m,) whether the faces of its condition in its cell are offset from the cell's centroid.
+
+    `off` (m, d), in cells, are vectors along the faces from the foot of the centroid.  The faces' mean vector decides.
+    """
+    _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
+    at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
+    count = int(at.max(initial=-1)) + 1
+    mean = sum_by(at, (size[:, None] * off).T, count) / sum_by(at, size, count)
+    return (np.abs(mean) > ALONG).any(axis=0)[at]

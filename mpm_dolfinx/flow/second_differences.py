@@ -3,10 +3,11 @@
 
     (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
 
-with the edge h of the cell and the distances d_+- between centroids of the material.  A cell has a term along an axis
-if both its faces are open.  For alternating pressures the coefficient is 16 w; a damping of jumps has 4 times its
-coefficient.  A uniform gradient is not damped, so steep pressures are not smeared, up to the sides of the body.
-The sum of H p over the cells is zero, so the damping is conservative.
+with the edge h of the cell along the axis, and the distances d_+- between centroids of the material.  A cell has a term
+along an axis if both its faces are open.  The damping coefficient of a pressure that alternates from cell to cell is
+16 w, where a damping of pressure jumps with weight w would have 4 w.  A uniform gradient is not damped, so steep
+pressures are not smeared, up to the sides of the body.  The sum of H p over the cells is zero, so damping conserves
+fluid.
 """
 
 from __future__ import annotations
@@ -27,20 +28,21 @@ def second_differences(
     centroid: NDArray[np.float64],
     opening: NDArray[np.float64],
 ) -> PETSc.Mat:
-    """Return the matrix H; its pattern depends on the active cells alone.
+    """Return the matrix H.  The pattern depends on the active cells only.
 
     Parameters
     ----------
     unknowns
-        The pressures of the active cells.
+        Pressure unknowns of the active cells.
     grid
         Background grid.
     strength : (n, d), m^d/Pa
-        Equivalent coefficient of a damping of jumps at open faces, of the owned active cells along each axis, >= 0.
+        Coefficient of a damping of jumps that would damp alternating pressures equally, >= 0.  For each owned active
+        cell and axis.
     centroid : (c, d), m
-        Centroids of the material in the local cells, from their midpoints.
+        Centroids of the material in the local cells, relative to the midpoints of the cells.
     opening : (c, d, 2)
-        Open fractions of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
+        Open fractions of the lower and upper faces of the local cells.  In axisymmetry they include `Grid.around`.
     """
     own = unknowns.owned
     number = unknowns.map.indices

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-Soils lie in series between the pressure positions of two cells.  The pressures at the interfaces are local unknowns of
-each face.  Newton's method finds them from the continuity of the flux, and they are condensed.  Each soil conducts like
-a pair of cells with this soil alone (`fitted`).  Steady flow through layers of exponential soil is therefore exact at
-any offset from the grid.
+The soils between the pressure positions of two cells lie in series.  The pressures at their interfaces are local
+unknowns of each face.  Newton's method finds them from the continuity of the flux; they are then condensed.  Each soil
+conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
+therefore exact at any offset from the grid.
 
-Lines through a cell (see `layers`) with a single soil up to the face conduct in parallel.  Lines with several soils are
-combined: each soil has its mean fraction of the length, in the order along the lines.
+The lines through a cell (see `layers`) that cross a single soil up to the face conduct in parallel.  All lines that
+cross several soils are combined to one line: in the order along the lines, each soil has its mean fraction of length.
 """
 
 from __future__ import annotations
@@ -23,33 +23,32 @@ from mpm_dolfinx.base.tolerances import EPSILON, SAME, TINY
 from mpm_dolfinx.flow.unsaturated import Laws
 from mpm_dolfinx.pores.retention import FARTHEST
 
-MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
+MOST = 2200  # largest number of iterations.  Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
 
 
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
-    parallel (l,): mobilities, m^2/(Pa s), of lines with a single retention curve, weighted by their fraction of all
-    lines; the first entry is saturated soil.  The other lines have s soils in series: law (s,): -1 for unused entries;
-    length (s,): fraction of the path; resistance (s,): length / (mobility x fraction of lines), Pa s/m^2.
+    Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; the first is saturated
+    soil.  The other lines are combined to one with s soils in series.
     """
 
-    parallel: NDArray[np.float64]
-    law: NDArray[np.int64]
-    length: NDArray[np.float64]
-    resistance: NDArray[np.float64]
+    parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
+    law: NDArray[np.int64]  # retention curve of each soil in series, -1 for unused entries (s,)
+    length: NDArray[np.float64]  # fraction of the path in each soil (s,)
+    resistance: NDArray[np.float64]  # length / (mobility x fraction of lines) (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths at an index."""
+        """Return the paths with an index of the arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
-        """Return paths (n, ...) repeated for both ends of all axes (n, d, 2, ...)."""
+        """Return the paths (n, ...), repeated for both ends of all axes (n, d, 2, ...)."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
     def with_slots(self, count: int) -> Paths:
-        """Return paths padded to `count` soils in series."""
+        """Return the paths padded with unused entries to `count` soils in series."""
         more = [(0, 0)] * (self.law.ndim - 1) + [(0, count - self.law.shape[-1])]
         law, length, resistance = (
             np.pad(values, more, constant_values=v) for values, v in zip(self[1:], (-1, 0, 0), strict=True)
@@ -57,20 +56,20 @@ class Paths(NamedTuple):
         return Paths(self.parallel, law, length, resistance)
 
     def eased(self, factor: NDArray[np.float64]) -> Paths:
-        """Return paths (n, d, 2, ...) with mobilities times a factor (n, d) along the axes."""
+        """Return the paths (n, d, 2, ...) with mobilities multiplied by a factor (n, d) along each axis."""
         factor = factor[:, :, None, None]
         return self._replace(parallel=self.parallel * factor, resistance=self.resistance / factor)
 
 
 class Through(NamedTuple):
-    """Conductances (m,), m/(Pa s), and derivatives of the flux with respect to the pressures on both sides."""
+    """Conductances of m faces between two pressures."""
 
-    conductance: NDArray[np.float64]
-    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]
+    conductance: NDArray[np.float64]  # (m,), m/(Pa s)
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # derivatives of the flux by both pressures (m,), m/(Pa s)
 
 
 def none(count: int, laws: int, slots: int) -> Paths:
-    """Return paths (count, ...) without conductance."""
+    """Return paths (count, ...) that conduct nothing."""
     return Paths(
         np.zeros((count, laws)),
         np.full((count, slots), -1),
@@ -80,24 +79,24 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Links, soils between two nodes of a face: face, nodes, law, conductance, hydrostatic pressure drop, Pa."""
+    """Segments of soil along the flow path through a face.  Each connects two nodes, which have pressures."""
 
-    face: NDArray[np.int64]
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    law: NDArray[np.int64]
-    conductance: NDArray[np.float64]
-    drop: NDArray[np.float64]
+    face: NDArray[np.int64]  # the face
+    low: NDArray[np.int64]  # first node
+    high: NDArray[np.int64]  # second node
+    law: NDArray[np.int64]  # number of the retention curve
+    conductance: NDArray[np.float64]  # at k_r = 1, m/(Pa s)
+    drop: NDArray[np.float64]  # hydrostatic pressure drop, Pa
 
 
 class _Flows(NamedTuple):
-    """Conductances of links; derivatives of the flux with respect to both nodes' pressures; fluxes; rounding errors."""
+    """Flows through the segments."""
 
-    k: NDArray[np.float64]
-    own: NDArray[np.float64]
-    other: NDArray[np.float64]
-    flux: NDArray[np.float64]
-    rounding: NDArray[np.float64]
+    k: NDArray[np.float64]  # conductance, m/(Pa s)
+    own: NDArray[np.float64]  # derivative of the flux by the pressure of the first node
+    other: NDArray[np.float64]  # minus the derivative by the pressure of the second node
+    flux: NDArray[np.float64]  # flux from the first to the second node, m/s
+    rounding: NDArray[np.float64]  # rounding error of the flux, m/s
 
 
 def through(
@@ -112,7 +111,7 @@ def through(
     Parameters
     ----------
     laws
-        Conductivities by the pressure.
+        Relative conductivities as functions of pressure.
     p
         Pressures on both sides (m,), Pa.
     paths
@@ -120,7 +119,7 @@ def through(
     lengths
         Lengths of these paths (m,), m.
     drops
-        Pressure drops (m,) by the fluid's weight along each path, from the first side to the second, Pa.
+        Pressure drops (m,) caused by the fluid's weight along each path, from the first side to the second, Pa.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -133,7 +132,7 @@ def through(
 
 
 class _Chain:
-    """Faces with equal numbers of soils in series, and a node at each interface."""
+    """Faces with the same numbers of soils in series.  Each interface between soils is a node with a pressure."""
 
     def __init__(self, laws: Laws, paths: Sequence[Paths], count: Sequence[int], p, lengths, drops):
         self._laws, self._p = laws, p
@@ -144,7 +143,7 @@ class _Chain:
         for side, path in enumerate(paths):
             first, drop = len(hydrostatic) - 1, drops[side]
             for j in range(count[side]):
-                slot = count[side] - 1 - j if side else j  # the second way begins at its place
+                slot = count[side] - 1 - j if side else j  # the second path is listed from the cell to the face
                 used = path.law[:, slot] >= 0
                 part = np.where(used, path.length[:, slot], 1.0) * drop
                 with np.errstate(divide="ignore"):
@@ -161,7 +160,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return conductances and slopes (3, m)."""
+        """Return conductances and derivatives of the flux (3, m) between both ends."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)
@@ -184,17 +183,17 @@ class _Chain:
                 low, high = np.where(step > 0, old, low), np.where(step < 0, old, high)
             new = np.clip(old + step, low, high)
             y, to = np.arcsinh(old / scale), np.arcsinh(new / scale)
-            # a step in the opposite direction is at most half of the step before
+            # a step opposite to the previous step is at most half as long
             most = np.where(previous * (to - y) < 0, np.abs(previous) / 2, np.minimum(1.25 * most, FARTHEST))
             far = (np.abs(to - y) > most) & (np.minimum(y, to) < 0)
             previous = np.where(far, np.clip(to - y, -most, most), to - y)
             new = np.where(far, (scale * np.sinh(np.where(far, y + previous, 0.0))).clip(low, high), new)
             done = (balanced | (np.abs(new - old) <= SAME * (np.abs(old) + size))).all()
             p[:, inner] = np.where(balanced, old, new)
-        raise NotConverged("soils in series: no solution for the pressure at their border")
+        raise NotConverged("soils in series: no solution for the pressure at their interface")
 
     def _flows(self, p: NDArray[np.float64]) -> _Flows:
-        """Return the flows at pressures of the nodes (m, nodes), Pa."""
+        """Return the flows at node pressures p (m, nodes), Pa."""
         links = self._links
         ends = p[links.face, links.low], p[links.face, links.high]
         k, slopes = self._laws.between(links.law, ends, links.drop)
@@ -204,13 +203,13 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values of the links in series (m, nodes - 1)."""
+        """Return the values of the segments in series (m, nodes - 1)."""
         starts = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
 
     def _step(self, flows: _Flows) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return steps (m, nodes - 2) of Newton's method, and nodes with a continuous flux within rounding."""
+        """Return steps of Newton's method (m, nodes - 2), and which nodes have continuous flux within rounding."""
         links, shape = self._links, self._hydrostatic.shape
 
         def at(node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -230,7 +229,7 @@ class _Chain:
         return x, balanced
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
-        """Return conductances and flux derivatives (3, m) between the ends: soils in series, with parallel lines."""
+        """Return conductances and flux derivatives (3, m) between both ends, from all segments of a face."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
@@ -245,7 +244,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return conductance and flux derivatives (3, m) of two links in series; first may be None."""
+    """Return conductance and flux derivatives (3, m) of two segments in series.  `first` may be None."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

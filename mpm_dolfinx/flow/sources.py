@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""User-defined sources of the pore fluid: see `user_functions`, `conditions.Source`."""
+"""User-defined sources of the pore fluid, see `user_functions` and `conditions.Source`."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from mpm_dolfinx.materials.user_functions import compiling, form
 
 
 class Sources(Feeding):
-    """The sources of a scene, for all of its stages.
+    """All sources of a scene, for all stages.
 
     Parameters
     ----------
     sources
-        Functions.
+        User functions that return UFL terms.
     pieces
-        All quadrature points.
+        Quadrature points of all pieces.
     p
-        DG0 pore pressure, Pa.
+        Pore pressure of the cells (DG0), Pa.
     t : s
         Time at the end of the substep, a UFL constant.
     """
@@ -52,11 +52,11 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the inflow rate of the filled cells at p, m^d/s, in a local array."""
+        """Return the inflow rates into the filled cells at p, m^d/s, as a local array."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return its derivative with respect to the cell's pressure, m^d/(Pa s)."""
+        """Return the derivative of `gain` by the pressure of the cell, m^d/(Pa s), as a local array."""
         return self._sum(self._slopes, pieces)
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:
@@ -67,16 +67,16 @@ class Sources(Feeding):
         return b
 
     def placed(self, wet: Wet) -> Feeds:
-        """Return the sources at the pieces."""
+        """Return the inflow from the sources in a substep."""
         return SourceFeeds(self, wet)
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points with pieces in cells with a source."""
+        """Return the points with pieces in cells that contain a source."""
         return cut.pieces.point[cut.to_pieces(self.gain(pieces)[cut.cells] != 0)]
 
 
 class SourceFeeds(Feeds):
-    """Sources in a substep."""
+    """Inflow from the sources in a substep."""
 
     def __init__(self, sources: Sources, wet: Wet):
         self._sources = sources
@@ -84,10 +84,10 @@ class SourceFeeds(Feeds):
         self.linear = sources.linear
 
     def leaving(self, at: None, fluid: Fluid) -> Leaving:
-        """Return minus the inflow of the cells."""
+        """Return minus the inflow into the cells."""
         gain = self._sources.gain(self._pieces)[self._cells]
         return Leaving(-gain, gain=np.abs(gain))
 
     def slope(self, at: None, fluid: Fluid) -> NDArray[np.float64]:
-        """Return minus the derivative of the inflow."""
+        """Return minus the derivative of the inflow by the cell's pressure."""
         return -self._sources.slope(self._pieces)[self._cells]

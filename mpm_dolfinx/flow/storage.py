@@ -1,31 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Storage of the pore fluid: DG0 on the grid, a finite volume method.  For open sides see `drained_sides`.
+"""Storage of the pore fluid: a finite volume method with constant pressures (DG0) in the cells.
 
-In each active cell, with J_Delta = det(I + grad u) (div u would turn a rotation into a volume change),
+`drained_sides` treats open sides.  The fluid balance of an active cell, with J_Delta = det(I + grad u), is
 
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
-    Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
+    Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-r = exp(p / K_w) is the fluid density over the density rho_w at zero pressure.  In zeta it is taken at (p_n + p) / 2, on
-a face as the logarithmic mean.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass that
-leaves a cell enters its neighbour.  The residual is this equation over r; its tangent neglects differences of r.  A is
-the exact overlap of the body with the face, x+- are the centroids of the material in the cells, and d+- their distances
-to the face.  `layers` defines kappa and d of mixed cells.  Distances from the centroids keep the error at 0.2 % for any
-filling; half of the cell size would reach 12 %.  `nonorthogonal` corrects faces between centroids that are not opposite
-each other.  The sum over the cells is the fluid balance.  `fluid_content` defines the change of the content, and
-`time_integration` the integral over a substep.
+(div u in place of J_Delta would turn rotations into volume changes.)  r = exp(p / K_w) is the fluid density divided by
+the density rho_w at zero pressure.  In zeta, r is taken at the pressure (p_n + p) / 2, on a face as the logarithmic
+mean.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the
+neighbour.  The residual is this equation divided by r; its tangent neglects differences of r.  A is the exact overlap
+of the body with the face.  x+- are the centroids of the material in both cells, and d+- their distances from the face.
+`layers` defines kappa and d of mixed cells.  With distances from the centroids the error is 0.2 % for any filling; with
+half of the cell size it would reach 12 %.  `nonorthogonal` corrects faces between centroids that are offset along the
+face.  The sum of the equations over the cells is the fluid balance.  `fluid_content` defines the change of the content,
+and `time_integration` the integral over a substep.
 
-Corners follow more than u, points change cells, and pressure jumps are damped (below).  The volumes of domains
-therefore drift from their fluid content.  Points carry this volume defect, `owed`.  The next steps correct fractions of
-it, `defect`, at a constant rate over the step.
+The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
+other cells, and pressure jumps are damped (see below).  Points carry the difference, a volume defect (`owed`).  The
+next steps correct fractions of it (`defect`), at a constant rate over the step.
 
-Q1 with DG0 violates the inf-sup condition for vanishing flow within a step: alternating pressures have no effect.  A
-stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], with d = d+ + d-
-and the weight dt, s, of the rate at p.  The coefficient dt kappa A / d of a face is thus raised to tau d A if it is
-smaller.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil tau is a quarter of
-Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in plastic flow needs up to a hundred times
-more.  The additional damping acts on second differences only (`second_differences`), because damped jumps would smear
-steep pressures.
+If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
+alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
+term max(0, tau d - dt kappa / d) A [p - p_n], with d = d+ + d- and the weight dt, s, of the rate at p.  This raises the
+coefficient dt kappa A / d of a face to tau d A if it is smaller.  The stabilisation is conservative, and vanishes in
+steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja
+2021).  Soil in plastic flow needs up to a hundred times more.  The additional damping acts on second differences only
+(`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -52,67 +53,57 @@ from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
+from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.parts import OfParts, Parts
-from mpm_dolfinx.pores.retention import Retentions, logarithm, restrained
+from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
-"""Fraction of beta V that the filtered fixed-stress operator omits for checkerboard modes, in [0, 1].
+"""Fraction of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
 
-Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 5.2e-11, twice by 1.3e-10, finer cells by 1.5e-02.
 """
 
 
 FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
-"""See `StorageProblem.flux_slope`."""
+"""Function that returns the change of outflow volumes for a change of u, see `StorageProblem.flux_slope`."""
 
 
 class CellPressure(NamedTuple):
-    """Pore pressure of the cells in a step, DG0, Pa: at the present iterate, and at the start of substep and step.
+    """Pore pressure of the cells (DG0) in a step, Pa.  Between two steps the pressure is in `State.pieces`."""
 
-    Between two steps the pressure is in `State.pieces`.
-    """
-
-    now: fem.Function
-    before: fem.Function
-    start: fem.Function
+    now: fem.Function  # at the current iterate
+    before: fem.Function  # at the start of the substep
+    start: fem.Function  # at the start of the step
 
 
 class StorageForms:
-    """The compiled forms of the storage of a scene's pore fluid.
+    """Compiled forms of the fluid balance of a scene.
 
     Parameters
     ----------
     pieces
-        Quadrature points with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`.  With a
-        specific yield also `drainage`: specific yield and suction (Pa), see `skeleton.unsaturated`.
+        Quadrature points with the fields `biot`, `storage` and `storage_at_one`, 1/Pa, see `change_of_content`.  With a
+        specific yield also `drainage`: specific yield and suction, Pa, see `skeleton.unsaturated`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
         Pore pressure of the cells, positive in compression.
     active
-        The active part of the grid.
-    bulk
-        Bulk modulus of the fluid, Pa.
+        Active part of the grid.
+    materials
+        Materials of the scene, and its fluid. With retention curves the pieces have the fields retention, lever, pores.
     weight : (d,), N/m^3
-        Weight of the pore fluid rho_w g as UFL, None without gravity.
+        Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
-        Whether alpha serves as the content's derivative with respect to J_Delta, for a symmetric Jacobian.  The
+        Whether to use alpha as the derivative of the content by J_Delta, so that the Jacobian is symmetric.  The
         neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
-    flows
-        Whether any material conducts; otherwise there are no fluxes.
-    softens
-        Whether soil may be softer than elastic.
-    conductivity
-        Conductivity laws, None without any.
     feeding
         Sources and open sides of all stages.
     inertial : (d,), N/m^3
-        Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
-    retentions
-        Retention curves of the scene, None without any; the pieces then carry retention, lever and pores.
+        Inertia force on the pore fluid, -rho_w a, as UFL; None without inertia.
     """
 
     def __init__(
@@ -121,22 +112,22 @@ class StorageForms:
         displacement: fem.Function,
         pressure: CellPressure,
         active: Active,
-        bulk: float,
+        materials: SceneMaterials,
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
-        flows: bool,
-        softens: bool,
-        conductivity: ConductivityAtPieces | None,
         feeding: Sequence[Feeding],
         inertial: ufl.core.expr.Expr | None = None,
-        retentions: Retentions | None = None,
     ):
         self.grid = pieces.grid
         self.p, self.p_n = pressure.now, pressure.start
         self.p_before = pressure.before
-        self.bulk = bulk
+        self.bulk = bulk = materials.fluid.bulk
+        retentions, laws = materials.retentions, materials.conductivity_laws
         Q = self.p.function_space
-        self.conductivity = conductivity
+        self.conductivity = None
+        """Conductivity laws, None without any."""
+        if laws:
+            self.conductivity = ConductivityAtPieces(materials.materials, laws, pieces, displacement, self.p_before)
         self._work = fem.Function(Q)
         self._sums = self._work.x.array
         q = ufl.TestFunction(Q)
@@ -144,7 +135,7 @@ class StorageForms:
         J = ufl.det(delta)
         stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
         self.drains = "drainage" in pieces.sizes
-        """Whether pores drain as a free surface falls."""
+        """Whether pores drain when the water table falls."""
         if self.drains:
             yielded, suction = pieces.drainage
             stored += yielded * (filled(p, suction) - filled(self.p_n, suction))
@@ -162,39 +153,39 @@ class StorageForms:
         by_u = [pieces.biot * coupling * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
-        self.symmetric, self.softens = symmetric, softens
-        relative = Relative(pieces.grid, retentions) if self.retains and flows else None
-        self.fluxes = FluxForms(pieces.grid, active, weight, flows, self.p, bulk, inertial, relative)
+        self.symmetric, self.softens = symmetric, materials.evolves
+        relative = Relative(pieces.grid, retentions) if self.retains and materials.conducts else None
+        self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, self.p, bulk, inertial, relative)
         self.feeding = tuple(feeding)
         """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return the change of the fluid in the filled cells since the start of the step, m^d, in a local array."""
+        """Return the change of the fluid volume in filled cells since the start of the step, m^d, as a local array."""
         b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return derivatives of `change` with respect to pressure (filled cells,), m^d/Pa, and nodal displacements.
+        """Return the derivatives of `change` by pressure (filled cells,), m^d/Pa, and by nodal displacements.
 
-        The latter (filled cells, n), m^(d-1), are derivatives of alpha dJ_Delta, for the momentum, then of the content
-        if they differ.
+        The derivatives by displacements (filled cells, n), m^(d-1), are first derivatives of alpha dJ_Delta, for the
+        momentum balance; then derivatives of the content, if they differ.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the storage of the filled cells (n,) by their saturation, m^d/Pa, and S d(chi p)/dp, m^d, at p."""
+        """Return storage by saturation of filled cells (n,), m^d/Pa, and the integral of S d(chi p)/dp (n,), m^d."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow of active cells to other cells, due to p and the fluid's weight, m^d/s, as a local array.
+        """Return the outflow of active cells to other cells, m^d/s, as a local array, from p and the fluid's weight.
 
-        force (c, d): inertia force on the fluid in the local cells, N/m^3, or None.
+        `force` (c, d), N/m^3, is the inertia force on the fluid in the local cells, or None.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -208,30 +199,22 @@ class StorageForms:
 
 @dataclass(frozen=True)
 class Outflow:
-    """Conductances of the active owned cells at present displacements.
+    """Conductances of the n active owned cells at the current displacements."""
 
-    at: data of the feeds, see `Feeds.conducting`; total (n,): outflow to other cells per unit of mass potential,
-    m^d/(Pa s); mobility (n, d): m^2/(Pa s); nonorthogonal: non-orthogonal correction, or None.
-    """
-
-    at: Sequence[Any]
-    total: NDArray[np.float64]
-    mobility: NDArray[np.float64]
-    nonorthogonal: NonorthogonalFlow | None
+    at: Sequence[Any]  # data of the conditions on the fluid, see `Feeds.conducting`
+    total: NDArray[np.float64]  # outflow to other cells per unit of mass potential (n,), m^d/(Pa s)
+    mobility: NDArray[np.float64]  # mobility along the axes (n, d), m^2/(Pa s)
+    nonorthogonal: NonorthogonalFlow | None  # non-orthogonal correction
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Outflow rates of the owned cells, m^d/s, or with `integrated` outflow volumes, m^d.
+    """Outflow rates of the owned cells, m^d/s; after `integrated`, outflow volumes, m^d."""
 
-    cells: outflow of each cell less its sources; net: outflow from the bodies less sources; turnover: sum of inflow and
-    outflow; gain: absolute value of sources.
-    """
-
-    cells: NDArray[np.float64]
-    net: NDArray[np.float64]
-    turnover: NDArray[np.float64]
-    gain: NDArray[np.float64]
+    cells: NDArray[np.float64]  # outflow of each cell minus its sources
+    net: NDArray[np.float64]  # outflow from the bodies minus sources
+    turnover: NDArray[np.float64]  # sum of absolute inflows and outflows
+    gain: NDArray[np.float64]  # absolute value of sources
 
     def integrated(self, seconds: float) -> Rates:
         """Return the outflow volumes in a time, s."""
@@ -239,18 +222,18 @@ class Rates:
 
 
 class StorageSystem:
-    """Vectors and matrices of the pressures of one active set.
+    """Vectors and matrices of the pressure unknowns, for one set of active cells.
 
     Parameters
     ----------
     forms
-        The forms; the contents of the cells are set.
+        Compiled forms, with the material in the cells.
     cells, facets
         Active local cells, ghosts included, and the faces between two of them.
     momentum
         Unknowns of the displacement.
     parts
-        Parts of the bodies.
+        Connected parts of the bodies.
     """
 
     def __init__(
@@ -263,12 +246,12 @@ class StorageSystem:
     ):
         self._forms = forms
         self.symmetric = not forms.retains
-        """Whether the matrix of the pressures alone is symmetric."""
+        """Whether the matrix of the pressure unknowns is symmetric."""
         d = forms.grid.dim
         fluxes = forms.fluxes
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), forms.grid.midpoints)
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
-        """Parts of the unknowns."""
+        """Connected part of each unknown."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
@@ -286,32 +269,32 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Fluxes by p and the fluid's weight between cells of equal soil, None without a weight."""
+        """Form of the fluxes by p and the fluid's weight between cells of the same soil; None without weight."""
         return self._over_uniform(self._forms.fluxes.gravity)
 
     def _over_uniform(self, form: FacetForm | None) -> FacetSum | None:
-        """Return a form over the faces between cells of equal soil, see `Relative`."""
+        """Return a form over the faces between cells of the same soil, see `Relative`."""
         relative = self._forms.fluxes.relative
         return form and form.on(self._facets if relative is None else relative.uniform(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return grid positions of this process's unknowns, and an empty list of fixed ones: see `multigrid_solver`."""
+        """Return the grid positions of this process's unknowns, and no fixed positions, see `multigrid_solver`."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set the change of the residual by displacements u, m^d: changes of content and, with slopes, of fluxes."""
+        """Set `out` to the change of the residual by displacements u, m^d: of content and, with `slopes`, of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outflow to other cells, m^d/s, by differences of the mass potentials (n,), Pa."""
+        """Return the outflow to other cells, m^d/s, caused by differences of the mass potentials pi (n,), Pa."""
         self._potentials.array_w[:] = pi
         return (self.T * self._potentials).array_r
 
     def set_alternation(self) -> None:
-        """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
+        """Assemble the matrix L of the filter, see `StorageProblem.assemble_preconditioner`."""
         zero(self.L)
         self._alternation.assemble_matrix(self.L)
         self.L.assemble()
@@ -323,7 +306,7 @@ class StorageSystem:
         flow: Conduction,
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces; off: arguments of `NonorthogonalFlow`, or None."""
+        """Assemble the fluxes through inner faces.  `off` are arguments of `NonorthogonalFlow`, or None."""
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
         if (relative := self._forms.fluxes.relative) is not None:
@@ -339,7 +322,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of fluxes between cells, in unsaturated soil at p; force: see `StorageForms.driven`."""
+        """Assemble the matrix of fluxes between cells, at p if unsaturated.  For `force` see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -353,35 +336,31 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Residual of the storage in each cell (m^d), and its scales in each part of the bodies (parts,), m^d.
-
-    exchanged: sum of all changes; round_off: bound of rounding errors; off: sum of absolute mass errors of the cells;
-    gain: change plus outflow less sources; rates: rates at (u, p).
-    """
+    """Residual of the fluid balance of each cell, m^d, and its scales in each connected part (parts,), m^d."""
 
     vector: PETSc.Vec
-    exchanged: NDArray[np.float64]
-    round_off: NDArray[np.float64]
-    off: NDArray[np.float64]
-    gain: NDArray[np.float64]
-    rates: Rates
+    exchanged: NDArray[np.float64]  # sum of all absolute changes
+    round_off: NDArray[np.float64]  # bound of rounding errors
+    off: NDArray[np.float64]  # sum of absolute mass errors of the cells
+    gain: NDArray[np.float64]  # change of content plus outflow minus sources
+    rates: Rates  # at (u, p)
 
 
 class StorageProblem:
-    """The storage of the pore fluid in one substep.
+    """The fluid balance in one substep.  The pressure at the start of the step is `forms.p_n`.
 
     Parameters
     ----------
     forms, system
-        Compiled forms; vectors and matrices, with the fluxes in them.
+        Compiled forms; vectors and matrices, with the assembled fluxes.
     data
-        The pieces.
+        Quadrature points of the pieces.
     contents
-        Contents of the cells.
+        Material in the cells.
     feeds
         Sources and open sides.
     flow
-        Function that assembles the outflow at (u, p); its argument tells whether a substep starts.
+        Function that assembles the outflow at (u, p).  The argument tells whether a substep starts.
     dt
         Weight of the rate at (u, p), s.
     before
@@ -389,13 +368,11 @@ class StorageProblem:
     softness : (m,)
         Softness of the pieces, see `SoftnessAtPoints`, if the soil may soften.
     defect : (n,), m^d
-        Correction of the volume defect in the active owned cells until the end of the substep.
+        Part of the volume defect in the active owned cells to be corrected until the end of the substep.
     inertial
-        Function that returns the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
+        Function that returns the inertia forces on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
         Suctions (n,), Pa, at which the pores of these cells drain, or None.
-
-    The pressure at the start of the step is that of `forms.p_n`.
     """
 
     def __init__(
@@ -425,19 +402,19 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
-        squared = 4 * forms.grid.most**2  # no two centroids are further apart than 2 h
+        squared = 4 * forms.grid.most**2  # the distance of two centroids is at most 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
-        if forms.retains:  # dry pores hardly couple the two balances, and their storage stabilises as well
+        if forms.retains:  # dry pores hardly couple both balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
             tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.ones(1)
         known = [(tau * squared > least).any(), (softest * tau * squared > least).any() and softest.max() > 1]
         somewhere = over_all(forms.grid.comm, np.array([*known, any(one.settles for one in feeds)], dtype=float)) > 0
         self.damped, flows, self._settles = somewhere.tolist()
-        """Whether jumps of the pressure are damped somewhere."""
+        """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._correction = self._begin(outflow)
-        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s, not in the tangent."""
+        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent leaves it out."""
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -447,7 +424,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the additional damping, less the flow, of cells with softness (n,) and damping tau (n,), 1/Pa."""
+        """Return the additional damping, minus the flow, of cells of softness (n,) and damping tau (n,), 1/Pa."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -462,22 +439,22 @@ class StorageProblem:
 
     @property
     def _density(self) -> NDArray[np.float64]:
-        """Mid-step density of the fluid in the active owned cells, over the density at zero pressure."""
+        """Density of the fluid in the active owned cells at mid-step, divided by the density at zero pressure."""
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
     def outflows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies by each condition at (u, p), m^d/s, by name."""
+        """Return the outflow from the bodies at (u, p), m^d/s, through each condition, by name."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name."""
+        """Return the rain that does not infiltrate, m^d/s, by name of the condition."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates of a solved substep for `volumes`."""
+        """Return the rates of a converged substep from which `volumes` are computed."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -491,21 +468,21 @@ class StorageProblem:
 
     @property
     def linear(self) -> bool:
-        """Whether the tangent does not depend on the pressure."""
+        """Whether the tangent is independent of the pressure."""
         drains = self.forms.drains or self.forms.retains
         return not drains and not self._settles and all(one.linear for one in self._feeds)
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in the cells, the weight of their pressures."""
+        """Volume fraction of material in each cell, by which its pressure is weighted."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the undrained pressure rise of the cells at fixed stress, Pa, for the volumes that they lost, m^d."""
+        """Return the undrained pressure rise of cells at fixed stress, Pa, for volumes that the cells lost, m^d."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return water-content errors due to pressure errors (n,), Pa, and the content's change in the step (n,)."""
+        """Return errors of the water content caused by pressure errors (n,), Pa, and changes of it in the step (n,)."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -513,12 +490,12 @@ class StorageProblem:
 
     @property
     def ring(self) -> float:
-        """Mean circumference of the contents of the cells in axisymmetry, m."""
+        """Mean circumference of the material in axisymmetry, m."""
         whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume.sum(), self._contents.area.sum()]))
         return float(whole / area)
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
-        """Start the substep of all feeds; return the non-orthogonal correction of fluxes between cells, m^d/s."""
+        """Start the substep for all conditions; return the non-orthogonal correction of fluxes between cells, m^d/s."""
         p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, difference = 0.0, np.zeros(sum(sides))
@@ -531,7 +508,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Relative accuracy of a linear solve: dry cells store little, so the error must not end up in them."""
+        """Relative accuracy of linear solves.  Dry cells store little fluid, so errors there must be small."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
@@ -539,16 +516,17 @@ class StorageProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
         """Return limited pressure decreases, Pa, and changes of the suction's logarithm (n,).
 
-        dp (n,): decreases by Newton's method, Pa; previous (n,): change of the logarithm in the iteration before.
+        `dp` (n,), Pa, are the decreases by Newton's method.  `previous` (n,) is the change of the logarithm in the
+        previous iteration.
         """
         p = self._p[0][self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, previous)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
-        """Update the active sets by the flow at (u, p); return whether they have changed.
+        """Update the active sets for the flow at (u, p); return whether any set has changed.
 
-        Newton's method solves for (u, p) with fixed active sets, then updates them.
+        Newton's method solves for (u, p) with fixed active sets, and then updates the sets.
         """
         if not self._settles:
             return False
@@ -560,10 +538,10 @@ class StorageProblem:
         self._flow(False)
 
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
-        """Return a function: change of the outflow volumes (n,), m^d, for a change of u along a vector, m.
+        """Return a function from a vector of displacements, m, to changes of outflow volumes (n,), m^d, along it.
 
-        It is a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the fluxes'
-        geometry.  `set_fluxes` resets the fluxes to u.  dofs: active degrees of freedom of u.
+        It uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the geometry of
+        the fluxes.  `set_fluxes` resets the fluxes to u.  `dofs` are the active degrees of freedom of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -581,7 +559,7 @@ class StorageProblem:
         return along
 
     def assemble_residual(self) -> StorageResidual:
-        """Return the residual of the storage at (u, p)."""
+        """Return the residual of the fluid balance at (u, p)."""
         forms = self.forms
         system = self.system
         before = self._before
@@ -627,24 +605,25 @@ class StorageProblem:
         return Rates(cells + net, net, turnover, gain)
 
     def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (n, d) of the active owned cells in an array (c, d) of the local ones."""
+        """Return values (n, d) of the active owned cells as an array (c, d) over local cells."""
         out = np.zeros((self.forms.grid.num_local, values.shape[1]))
         out[self.system.unknowns.owned] = values
         return out
 
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
-        """Return the net inflow (n,), m^d, of the filled owned cells in the step by fluxes and sources.
+        """Return the net inflow (n,), m^d, into the filled owned cells in the step by fluxes and sources.
 
-        Volumes refer to the mid-step density, as in `change`.  rates: at the end of the substep.
+        Volumes refer to the density at mid-step, as in `change`.  `rates` are the rates at the end of the substep.
         """
         return (-rates.integrated(self.dt).cells - self._before.cells) / self._density
 
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble the residual's derivatives C = d/dp and B = d/du at (u, p); data: other pieces than in the residual.
+        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for `data` in place of its pieces.
 
-        of_suction: cells (c,), and derivatives of their nodal forces (c, n) by p through suction in laws, m^(d-1).
+        `of_suction` are cells (c,) and derivatives of their nodal forces (c, n) by p, m^(d-1), if a law depends on
+        suction.
         """
         forms = self.forms
         system = self.system
@@ -670,16 +649,16 @@ class StorageProblem:
         _add_diagonal(system.C, capacity + self.dt * slope)
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
-        """Return the fixed-stress operator C + factor (beta V - share L) for the present C.
+        """Return the fixed-stress operator C + factor (beta V - share L) for the current C.
 
         Parameters
         ----------
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1]; 0 is the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
-            pressure, half of it (at nu = 0) for one that alternates along one axis, and zero for a checkerboard.
-            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q] <= beta V.
+            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
+            pressure, beta V / 2 (at nu = 0) for one that alternates along one axis, and zero for a checkerboard.
+            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
@@ -689,7 +668,7 @@ class StorageProblem:
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Add values to the diagonal of a matrix; return it."""
+    """Add values to the diagonal of a matrix; return the new diagonal."""
     d = A.getDiagonal()
     d.array_w[:] += values
     A.setDiagonal(d)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes in unsaturated soil: conductivities by the pressures on both sides of a face.
+"""Fluxes in unsaturated soil: conductivities of faces from the pressures on both sides.
 
-The conductivity of a face is its mean over the pressures between the two sides (`retention.Conductance`).  With the
-value of the wetter side a front would move too fast.  With gravity this mean is `fitted`, so steady flow through
-exponential soil is exact.  For mixed cells see `series`.
+The relative conductivity k_r of a face is the mean of k_r over the pressures between both sides
+(`retention.Conductance`).  With the value of the wetter side, a wetting front would move too fast.  With gravity the
+mean is modified (`fitted`), so that steady flow through exponential soil is exact.  See `series` for mixed cells.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mpm_dolfinx.pores.retention import Conductance, Retentions
 
 
 class Functions(NamedTuple):
-    """Functions of numbers, of arrays or as UFL."""
+    """Elementary functions for one type of arguments: arrays or UFL expressions."""
 
     ln: Callable[[Any], Any]
     exp: Callable[[Any], Any]
@@ -39,32 +39,32 @@ UFL = Functions(ufl.ln, ufl.exp, ufl.tanh, ufl.conditional, ufl.lt, ufl.max_valu
 
 
 class Between(NamedTuple):
-    """k_r between the two sides of a face, and its derivatives with respect to both pressures, 1/Pa."""
+    """Relative conductivity k_r between the two sides of a face."""
 
-    k: Any
-    slopes: tuple[Any, Any]
+    k: Any  # the value
+    slopes: tuple[Any, Any]  # derivatives by the pressures on both sides, 1/Pa
 
 
 def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
-    """Return k_r between the two sides of a face.
+    """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
-    With the mean k of k_r over the pressures, the jump x of k_r over k, y = x drop / jump of the pressure, and s(z) =
-    sinh(z / 2) / (z / 2), it is k s(x + y) / (s(x) s(y)).  This is exact for steady flow with an exponential k_r (Baker
-    1995), and never exceeds the wetter side.  Without gravity k remains (Kirchhoff 1894).  For nearly equal pressures k
-    is the mean of both sides.
+    k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k; y is x drop / (jump
+    of the pressure).  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).  It is exact for
+    steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.  Without gravity
+    it is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
 
     Parameters
     ----------
     p
         Pressures on both sides, Pa.
     tables
-        Values on both sides: integral of k_r, Pa; k_r; its derivative, 1/Pa; see `retention.Conductance`.
+        Values on both sides: integral of k_r, Pa; k_r; derivative of k_r, 1/Pa; see `retention.Conductance`.
     drop
-        Pressure drop by the fluid's weight from the first side to the second, Pa.
+        Pressure drop caused by the weight of the fluid from the first side to the second, Pa.
     scale
         Characteristic suction of k_r, Pa.
     of
-        Functions for arguments of their type: numbers, arrays or UFL.
+        Functions for the type of the arguments: arrays or UFL expressions.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
@@ -87,7 +87,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
 
 
 def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
-    """Return ln(sinh(z / 2) / (z / 2)) and its slope."""
+    """Return ln(sinh(z / 2) / (z / 2)) and the derivative by z."""
     small = of.less(abs(z), SECOND)
     half = of.where(small, 1.0, z / 2)
     size = abs(half)
@@ -96,17 +96,17 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """Conductivities as functions of pressure, by number of the retention curve; 0: soil that stays saturated."""
+    """Relative conductivities as functions of pressure, by number of the retention curve; 0 for saturated soil."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]
         self.scales = np.array([1 / TINY, *(law.scale for law in self.conductances)])
-        """Characteristic suctions, Pa."""
+        """Characteristic suctions of the laws, Pa."""
 
     def between(
         self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], drop: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) of laws (m,) between pressures on both sides (m,), Pa, and slopes (2, m): see `fitted`."""
+        """Return k_r (m,) of laws (m,) between pressures on both sides (m,), Pa, and slopes (2, m), see `fitted`."""
         k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
         for number, one in enumerate(self.conductances, 1):
             rows = np.flatnonzero(law == number)
@@ -118,19 +118,19 @@ class Laws:
 
 
 class Relative:
-    """Relative conductivities of cells as functions of their pressures.
+    """Relative conductivities of cells as functions of the cell pressures.
 
     Parameters
     ----------
     grid
         Background grid.
     retentions
-        The laws of the scene.
+        Retention curves of the scene.
 
     Attributes
     ----------
     shares
-        DG0: fractions of a cell's mobility at k_r = 1, of soil that stays saturated and of each retention curve.
+        DG0: fractions of the mobility of a cell at k_r = 1 from soil without a retention curve, and from each curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -143,7 +143,7 @@ class Relative:
         self._flows: Latest[Any] = Latest()
 
     def between(self, pressure: fem.Function, drop) -> list[Between]:
-        """Return k_r of each law between the two sides of a face as UFL variables: see `fitted`."""
+        """Return k_r of each law between the two sides of a face, as UFL variables, see `fitted`."""
         out = []
         for i, law in enumerate(self._laws.conductances):
             tables = [[self._tables(side)[3 * i + j] for j in range(3)] for side in "+-"]
@@ -153,14 +153,14 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return k_r of the cell on one side of a face, as a UFL function of each retention curve's k_r."""
+        """Return k_r of the cell on one side of a face, as UFL expression of k_r of each retention curve."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
-        """Set the coefficients of forms for pressures of the local cells (c,), Pa.
+        """Set the coefficients of forms for pressures p of the local cells (c,), Pa.
 
-        Return the fluxes through faces between cells of different soil, see `borders`, or None without such faces.
-        force (c, d): inertia force on the fluid, N/m^3.
+        Return the fluxes through faces between cells of different soil, see `borders`; None if there are no such faces.
+        `force` (c, d), N/m^3, is the inertia force on the fluid.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
@@ -169,7 +169,7 @@ class Relative:
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
     def uniform(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the faces between active cells of equal soil."""
+        """Return the facets between active cells of the same soil."""
         faces = self._borders.value
         return facets if faces is None else faces.borders.uniform
 
@@ -186,10 +186,10 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) of owned cells along normals (m, d) between their pressures and others (m,), Pa.
+        """Return k_r (m,) along normals (m, d), between pressures p of owned cells and outside pressures (m,), Pa.
 
-        Also return the derivative of k_r times the potential difference with respect to these pressures; drop (m,):
-        pressure drop by the fluid's weight out of the cells, Pa.
+        Also return the derivative by p of k_r times the potential difference.  `drop` (m,), Pa, is the pressure drop
+        out of the cell caused by the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()
@@ -204,13 +204,13 @@ class Relative:
         return k, np.maximum(derivative, 0.0)
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
-        """Set the shares (n, count) of the filled owned cells."""
+        """Set the fractions (n, count) of the filled owned cells, see `shares`."""
         self.shares.x.array[:] = 0.0
         self.shares.x.array.reshape(-1, self.count)[filled] = shares
         self.shares.x.scatter_forward()
 
     def set_borders(self, contents, flow, places: NDArray[np.float64], moved: NDArray[np.float64]) -> None:
-        """Set the faces between cells of different soil for the present conductivities: see `borders`."""
+        """Set the faces between cells of different soil for the current conductivities, see `borders`."""
         borders = flow.mobility.borders
         make = partial(borders.faces, self._laws, contents, flow, places, moved) if borders else lambda: None
         self._borders(object(), make)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices: forms of Q1 vectors, summed over the points of each cell before insertion.
+"""Nodal forces and element matrices of Q1 vectors.  Sums over the points of each cell precede insertion.
 
-Inserting the matrix of every point costs more than computing it.
+Inserting a matrix for every point would cost more than computing it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the Q1 shape functions at the point as UFL; in 3D, their means over a piece."""
+    """Return the gradients of the Q1 shape functions at the point, as UFL; in 3D their means over the piece."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []
@@ -40,7 +40,7 @@ def shape_gradients(points: FormPoints) -> list:
 
 
 def shape_hoops(points: FormPoints) -> list:
-    """Return the means of N / r of the cell's Q1 shape functions N as UFL, in axisymmetry; see `FormPoints.hoop`."""
+    """Return the means of N / r for the Q1 shape functions N, as UFL, in axisymmetry; see `FormPoints.hoop`."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
@@ -50,7 +50,7 @@ def shape_hoops(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v at the points as UFL, for the shape function of each node along each axis as v."""
+    """Return T : grad v at the points, as UFL; v is the shape function of each node along each axis."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -62,27 +62,27 @@ def along_shapes(T, points: FormPoints) -> list:
 
 
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the unrolled local dofs (cells, n) of Q1 vectors in cells."""
+    """Return the unrolled local dofs (cells, n) of Q1 vectors in these cells."""
     dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
     return dofs.reshape(len(cells), dofs.shape[1] * grid.dim)
 
 
 def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray[np.float64]) -> None:
-    """Add the element matrices of Q1 vectors (cells, n, n) in cells to `A`."""
+    """Add the element matrices (cells, n, n) of Q1 vectors to `A`."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add values (cells, n) for the Q1 vectors of cells to `A`, which has one row a cell; the caller finalises it."""
+    """Add rows (cells, n) for Q1 vectors in cells to `A`, which has one row per cell, without final assembly."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return rows and columns of the stored entries of a matrix, and the index of each entry among the stored ones."""
+    """Return rows and columns of the stored entries of a matrix, and the index of each entry among these."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -92,57 +92,53 @@ def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
 
 
 class ElementForces:
-    """The linear form T : grad v of Q1 vectors over points, summed in each cell.
+    """The linear form T : grad v of Q1 vectors, integrated over points by summation in each cell.
 
     Parameters
     ----------
     stress : UFL tensor (d, d)
-        T[i, k] at the points.
+        Components T[i, k] at the points.
     points
-        The points.
+        Points of the forms.
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
         self._sums = CellSums(along_shapes(stress, points), points)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay in the ghost entries."""
+        """Add the vector to the local array `b`.  Contributions to ghosts remain in the ghost entries."""
         dofs, at = data.places.dofs
         b[dofs] += sum_by(at, self._sums(data).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):
-    """Further sums over the points of a cell, computed with an element matrix A: kernels share common terms.
+    """Further integrals over each cell, computed together with an element matrix A: kernels share common terms."""
 
-    along: UFL tensors (d, d) T[i, k] at the points, contracted as A is: with grad v, or with grad v F, for each
-    displacement;
-    scalars: UFL scalars at the points.
-    """
-
+    # UFL tensors T[i, k] (d, d), contracted like A: with grad v, or with grad v F, for each nodal displacement
     along: Sequence[ufl.core.expr.Expr] = ()
-    scalars: Sequence[ufl.core.expr.Expr] = ()
+    scalars: Sequence[ufl.core.expr.Expr] = ()  # UFL scalars
 
 
 NOTHING = Beside()
 
 
 class ElementMatrices:
-    """The bilinear form grad v : A : grad u of Q1 vectors over points, summed in each cell before insertion.
+    """The bilinear form grad v : A : grad u of Q1 vectors, summed over the points of each cell before insertion.
 
-    Inserting the matrix of every point costs twice as much as computing it. The entries of the element matrix are A,
-    contracted with the gradients of the shape functions at the point. DG0 test functions make the assembler sum them
-    over the points of a cell. Each cell is then inserted once.
+    Inserting a matrix for every point costs twice as much as computing it.  The entries of the element matrix are A
+    contracted with the gradients of the shape functions at the point.  Through DG0 test functions, the assembler sums
+    these entries over the points of a cell.  Each cell is then inserted once.
 
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points.
+        Components A[i, k, j, l] at the points.
     points
-        The points.
+        Points of the forms.
     symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: only half of the entries are then computed.
+        Whether A[i, k, j, l] = A[j, l, i, k]; if so, only half of the entries are computed.
     beside
-        Further sums.
+        Further integrals.
     """
 
     def __init__(
@@ -163,19 +159,17 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, by unrolled local dofs; return the other sums (cells, quantities).
-
-        The caller finalises the matrix.
-        """
+        """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
         sums = self._sums(data)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
 
 
 def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
-    """Return the contribution of circumferential strains to an entry of an element matrix as UFL.
+    """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
-    tangent (3, 3, 3, 3): as for `ElementMatrices`; row, column: node and axis of the two displacements.
+    `tangent` (3, 3, 3, 3) is that of `ElementMatrices`.  `row` and `column` are node and axis of the displacements v,
+    u.
     """
     (v, i) = row
     (u, j) = column
@@ -190,27 +184,18 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 
 
 class StackedElementMatrices:
-    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors over points: kernels evaluate A, BLAS contracts it.
+    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors: kernels evaluate A, BLAS contracts it.
 
-    It serves 3D, where cells hold many points. The gradients of the shape functions, times F, are stacked over the n
-    points of a cell. The element matrix is then one product of an 8 x 3n with a 3n x 72 matrix. Each batch of cells
-    holds about the same number of points.
+    In 3D, cells contain many points, so contraction by BLAS is faster.  The gradients of the shape functions,
+    multiplied by F, are stacked for the n points of a cell.  The element matrix is then the product of an 8 x 3n and a
+    3n x 72 matrix.  Each batch consists of cells with about the same number of points.
 
-    Hencky's law with 20 points a cell takes 4.2 us a point and 86 us a cell: 2.3 the kernel, 1.4 the products, 0.4 the
-    insertion. Inserting 24 x 24 entries a point took 13.8 us. The 300 sums a cell of `ElementMatrices` take 4.8 us and
-    twice the time to compile (13 s against 7 s). Merging the points of each octant of a cell, 8 in a cell, costs the
-    convergence of Newton's method on a bending beam.
+    Run time for Hencky's law and 20 points per cell: 4.2 us per point and 86 us per cell.  Of the 4.2 us, the kernel
+    takes 2.3, the products 1.4, the insertion 0.4.  Inserting 24 x 24 entries for each point took 13.8 us.  The 300
+    sums of `ElementMatrices` take 4.8 us, and compile in 13 s in place of 7 s.  If the points in each octant of a cell
+    are merged (8 points), Newton's method does not converge for a bending beam.
 
-    Parameters
-    ----------
-    tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points.
-    points
-        The points, with the field F (d, d).
-    symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: only half of the entries are then computed.
-    beside
-        Further sums.
+    Parameters: see `ElementMatrices`; the points have the field F (d, d).
     """
 
     def __init__(
@@ -228,10 +213,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, by unrolled local dofs; return the other sums (cells, quantities).
-
-        The caller finalises the matrix.
-        """
+        """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
         live, filled = self._values.live(data), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
@@ -240,7 +222,7 @@ class StackedElementMatrices:
         return sums
 
     def _of_batch(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the element matrices (cells, n, n) of a batch of cells, and the other sums (cells, quantities)."""
+        """Return the element matrices (cells, n, n) of a batch of cells, and further integrals (cells, quantities)."""
         d, (cells, most) = self._d, missing.shape
         g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)
@@ -262,9 +244,9 @@ class StackedElementMatrices:
 
 
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
-    """Return batches of cells with about as many points each: cells (c,), points (c, most), padding (c, most).
+    """Return batches of cells with similar numbers of points: cells (c,), points (c, most), padding (c, most).
 
-    Cells are indices into `Places.filled`; padding is True beyond a cell's own points.
+    Cells are indices into `Places.filled`.  Padding is True for entries after the last point of a cell.
     """
     cells = places.cells
     filled = places.filled

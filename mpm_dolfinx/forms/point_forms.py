@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Forms at material points: any UFL form, evaluated at the positions of the points.
 
-A multilinear function on a box is a polynomial of degree d. Its Taylor series about the cell's midpoint ends after d
-terms. With xi = x_p - x_mid,
+A multilinear function on a box is a polynomial of degree d.  Its Taylor series about the midpoint of the cell ends
+after d terms.  With xi = x_p - x_mid,
 
-    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   the right side taken at the midpoint.
+    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   with the right side at the midpoint.
 
-The right side is plain UFL, integrated by the one-point rule. The offset xi and all other data of a point are DG0
-coefficients. Each entry of the integral's list of entities has its own values of these coefficients.
+The right side is plain UFL, integrated by the one-point rule.  The offset xi and all other data of a point are DG0
+coefficients.  Each entry in the list of cells of the integral has separate values of these coefficients.
 
-The list names a cell once for each of its points, with one row of coefficients a point. The assembler then calls the
-kernel once a point, and int f w/|cell| dx over that list is sum_p w_p f(x_p). Generated code is not modified.
+The list contains a cell once for each point in it, with one row of coefficients per point.  The assembler therefore
+calls the kernel once for each point, and the integral of f w/|cell| over the list is sum_p w_p f(x_p).  The generated
+code is not modified.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Points in one batch of element matrices, which fits into the processor's cache; points in one call of an expression.
+"""Points in one batch of element matrices, which fits into the cache; points in one call of an expression.
 
-Few points take batches of the smaller size: a bound kernel is called for all of its cells.
+For few points the smaller number is used, because a bound kernel is called for all of its cells.
 """
 
 
 class PointMeasure(ufl.Measure):
-    """Measure with a weight, for sums over points: `f * dx` is sum_p w_p f(x_p)."""
+    """Integration measure with a weight, for sums over points: `f * dx` is sum_p w_p f(x_p)."""
 
     def __init__(self, mesh: Mesh, weight: ufl.core.expr.Expr, subdomain=_compat.SUBDOMAIN, degree: int = 0):
         super().__init__("dx", domain=mesh, subdomain_id=subdomain, metadata={"quadrature_degree": degree})
@@ -52,14 +53,14 @@ class PointMeasure(ufl.Measure):
 
 
 class FormPoints:
-    """The points as seen by forms: UFL coefficients, whose values come with a `PointData`.
+    """The points in forms: UFL coefficients, whose values are given by a `PointData`.
 
     Parameters
     ----------
     grid
-        The background grid.
+        Background grid.
     fields
-        Name and shape of each quantity of the points; `points.name` is its UFL coefficient.
+        Name and shape of each quantity at the points; `points.name` is the UFL coefficient.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -69,7 +70,7 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **_moments(grid), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
-        """Functions for the values (n, size) of fields that change while the points stay."""
+        """Functions that return the values (n, size) of fields that change between assemblies for the same points."""
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
@@ -81,17 +82,17 @@ class FormPoints:
         raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
-        """Return points in owned cells: see `PointData`; cells (n,), x (n, d) in m, weight (n,) in m^d."""
+        """Return points in owned cells (n,), at x (n, d), m, with weight (n,), m^d, and fields; see `PointData`."""
         return PointData(self, Places(self.grid, cells, x), weight, fields)
 
     def value(self, f):
-        """Return f at the point; f is a Q1 function, test or trial function of any shape."""
+        """Return f at the points, for a Q1 function, test or trial function f of any shape."""
         return self._taylor(f, self.grid.dim)
 
     def grad(self, f):
-        """Return grad f at the point; f is a Q1 function, test or trial function of any shape.
+        """Return grad f at the points, for a Q1 function, test or trial function f of any shape.
 
-        The gradient of a vector in axisymmetry is (3, 3), with f_r / r on its diagonal.
+        In axisymmetry the gradient of a vector is (3, 3), with f_r / r on the diagonal.
         """
         plane = self.plane_grad(f)
         if not (self.grid.axisymmetric and f.ufl_shape):
@@ -99,20 +100,21 @@ class FormPoints:
         return ufl.as_matrix([[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, self.hoop(f)]])
 
     def plane_grad(self, f):
-        """Return grad f at the point as `grad` does, in axisymmetry without the circumferential component."""
+        """Return grad f at the points like `grad`; in axisymmetry without the circumferential component."""
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
     def hoop(self, f):
-        """Return f_r / r of a Q1 vector f in axisymmetry: its mean over the piece of the point."""
+        """Return f_r / r of a Q1 vector f in axisymmetry, as the mean over the piece of each point."""
         *offset, product, radius = (self.functions["hoop"][i] for i in range(4))
         slope = ufl.grad(f[0])
         return (f[0] + ufl.dot(slope, ufl.as_vector(offset)) + ufl.grad(slope)[0, 1] * product) / radius
 
     def gradient(self, u: fem.Function) -> fem.Function:
-        """Return grad u at the point as a coefficient that numpy evaluates; u is a Q1 vector function.
+        """Return grad u at the points as a coefficient, for a Q1 vector function u; numpy evaluates it.
 
-        UFL derivatives with respect to u do not include it. All forms at the same u share its values. The Taylor series
-        has many terms in 3D. There a kernel of Hencky's law takes at most half of the time, its compilation a fifth.
+        UFL derivatives by u do not see this dependence.  All forms at the same u share the values.  In 3D the Taylor
+        series has many terms; with the coefficient a kernel of Hencky's law takes at most half of the time, its
+        compilation a fifth.
         """
         if "gradient" not in self.live:
             values = u.x.array
@@ -120,13 +122,13 @@ class FormPoints:
         return self.functions["gradient"]
 
     def follow(self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray]) -> fem.Function:
-        """Return a new field as a coefficient; each assembly calls `values` for its values (n, size) at the points."""
+        """Return a new field as a coefficient.  `values` returns the values (n, size) at each assembly."""
         self.functions[name] = self.grid.coefficient(shape)
         self.live[name] = values
         return self.functions[name]
 
     def increment(self, u: fem.Function):
-        """Return Delta = I + grad u at the points as UFL."""
+        """Return Delta = I + grad u at the points, as UFL."""
         if self.grid.axisymmetric and not self.grid.even:
             if "increments" not in self.live:
                 self.follow("increments", (3, 3), lambda data: data.increments(u.x.array.copy()))
@@ -134,14 +136,14 @@ class FormPoints:
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
     def moved_by(self, u: fem.Function):
-        """Return u at the points as UFL; on grids of many cell sizes as a coefficient, for reuse in other cells."""
+        """Return u at the points, as UFL; for unequal cells as a coefficient, so that kernels fit all cells."""
         if self.grid.even:
             return self.value(u)
         d = self.grid.dim
         return self.follow("displaced", (d,), lambda data: self.grid.at(data.cells, data.x, u.x.array.reshape(-1, d)))
 
     def deformation(self, u: fem.Function):
-        """Return F = Delta F_n at the points as a UFL variable; F_n is the field `F` of the points."""
+        """Return F = Delta F_n at the points, as a UFL variable; F_n is the field `F` of the points."""
         F = self.increment(u) * self.F
         return ufl.variable(block(F) if self.grid.axisymmetric else F)
 
@@ -149,30 +151,30 @@ class FormPoints:
         total = derivative = f
         for k in range(1, order + 1):
             derivative = term = ufl.grad(derivative)
-            for _ in range(k):  # contracting a k-th gradient halves the cost of nested grad(dot(., xi))
+            for _ in range(k):  # contracting the k-th gradient takes half of the time of nested grad(dot(., xi))
                 term = ufl.dot(term, self.offset)
             total += term / factorial(k)
         return total
 
 
 def _moments(grid: Grid) -> dict[str, tuple[int, ...]]:
-    """Return name and shape of the geometric moments of points in 3D and in axisymmetry; see `cutting.Pieces`."""
+    """Return names and shapes of the geometric moments of points in 3D and in axisymmetry, see `cutting.Pieces`."""
     return {"mixed": (3,)} if grid.dim == 3 else {"hoop": (4,)} if grid.axisymmetric else {}
 
 
 class Places(Keyed):
-    """Positions of points and their cells; immutable.
+    """Positions of points and their cells.  The object is immutable.
 
     Parameters
     ----------
     cells : (n,)
         Owned local cell of each point.
     x : (n, d), m
-        Positions.
+        Positions of the points.
     mixed : (n, d), m^2
-        Mean products of the offsets within a piece about its centroid, in 3D; see `Pieces`. None: zero.
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`.  None for points: zero.
     hoop : (n, 4)
-        Moments of axisymmetric pieces in the plane, see `Pieces`. None: moments of points.
+        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None for points: moments of points.
     """
 
     def __init__(
@@ -192,34 +194,34 @@ class Places(Keyed):
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
         self.hoop = hoop
         self.filled, self.slots = np.unique(cells, return_inverse=True)
-        """Cells that hold points; index of each point's cell among these."""
+        """Cells that contain points, and the index of the cell of each point among these."""
 
     @cached_property
     def nodal(self) -> NDArray[np.intp]:
-        """Unrolled local dofs (d, 2^d, cells) of Q1 vectors in the filled cells."""
+        """Unrolled local dofs (d, 2^d, cells) of Q1 vectors in the cells that contain points."""
         d = self.grid.dim
         return (self.grid.cell_nodes[self.filled] * d + np.arange(d)[:, None, None]).transpose(0, 2, 1).copy()
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Unrolled local dofs (n,) of Q1 vectors in the filled cells, and indices of each cell's dofs among them."""
+        """Unrolled local dofs (n,) of Q1 vectors in all cells with points; index of each cell's dofs in these."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
 
     def part(self, rows: NDArray[np.int64]) -> Places:
-        """Return the places of the points `rows`."""
+        """Return the positions of the points with indices `rows`."""
         mixed, hoop = (None if values is None else values[rows] for values in (self.mixed, self.hoop))
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at points, or means over pieces."""
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at points, or their means over pieces."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
     @cached_property
     def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
-        """For each axis products (n,) of offsets along sets of the others, or means: see `Grid.monomials`."""
+        """For each axis: products (n,) of offsets along sets of other axes, or their means, see `Grid.monomials`."""
         along = []
         for axis in range(self.grid.dim):
             others = [a for a in range(self.grid.dim) if a != axis]
@@ -231,7 +233,7 @@ class Places(Keyed):
         return along
 
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m: see `FormPoints.hoop`."""
+        """Return 1 + u_r / r (n,) for nodal displacements u (nodes, d), m, see `FormPoints.hoop`."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
         h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
         hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
@@ -240,18 +242,18 @@ class Places(Keyed):
 
 
 class PointData(Keyed):
-    """Points with weights and fields; immutable.
+    """Points with weights and fields.  The object is immutable.
 
     Parameters
     ----------
     points
-        The coefficients of the forms.
+        Coefficients of the forms.
     places
         Cells and positions of the points.
     weight : (n,), m^d
-        Volumes.
+        Volumes that the points represent.
     fields
-        Name and values (n, ...) of the points' fields; other names are ignored.
+        Values (n, ...) of the fields by name.  Names that the forms do not use are ignored.
     """
 
     def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
@@ -269,12 +271,12 @@ class PointData(Keyed):
         self._gradients: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
-        """Return the data of the points `rows`: their values of the fields of `points`, at the positions `places`."""
+        """Return the data of the points `rows`, for the fields of `points`, at the positions `places`."""
         fields = {name: self._rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 
     def having(self, **fields: NDArray[np.float64]) -> PointData:
-        """Return the same points with new values (n, ...) of some fields."""
+        """Return the same points, with new values (n, ...) of some fields."""
         kept = {name: self._rows[name] for name in self.points.sizes}
         return PointData(self.points, self.places, self.volume, kept | fields)
 
@@ -283,23 +285,23 @@ class PointData(Keyed):
         return self._rows[name]
 
     def gradients(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array; keeps the last ones."""
+        """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array; stores the last result."""
         nodal = u.take(self.places.nodal)
         return self._gradients(nodal, lambda: self._of_nodal(nodal))
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u (n, 9) of a Q1 vector with nodal values u, with the circumferential stretch."""
+        """Return I + grad u (n, 9), with the circumferential stretch, for a Q1 vector with nodal values u."""
         out = np.zeros((len(self.cells), 3, 3))
         out[:, :2, :2] = np.eye(2) + self.gradients_of(u).reshape(-1, 2, 2)
         out[:, 2, 2] = self.places.stretch(u.reshape(-1, 2))
         return out.reshape(len(out), 9)
 
     def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector function with nodal values u, a local array."""
+        """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array."""
         return self._of_nodal(u.take(self.places.nodal))
 
     def _of_nodal(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients from values at the nodes of the filled cells, see `Places.nodal`."""
+        """Return the gradients (n, d^2) from values at the nodes of the cells, see `Places.nodal`."""
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim
@@ -315,18 +317,18 @@ class PointData(Keyed):
 
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Rows of coefficients, and for each grid function among them its columns, its values, and their dofs by rows."""
+"""Rows of coefficients; and for each grid function among these the columns, the values, and the dofs of each row."""
 
 
 class Rows:
-    """Coefficients of a compiled form, one row a point.
+    """Coefficients of a compiled form at the points, one row per point.
 
     Parameters
     ----------
     compiled
-        The form.
+        The compiled form.
     points
-        The points.
+        Points of the form.
     """
 
     def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
@@ -349,11 +351,11 @@ class Rows:
         self._packed: Latest[Packed] = Latest()
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
-        """Return the present values of the form's fields that change while the points stay."""
+        """Return the current values of the fields that change between assemblies for the same points."""
         return {name: values(data) for _, name, values in self._changing}
 
     def room(self, size: int) -> NDArray[np.float64]:
-        """Return the buffer of the rows, at least `size`; it is kept between steps, because new memory is slow."""
+        """Return a buffer for at least `size` rows.  It is kept between steps, because allocation of memory is slow."""
         if self._room.value is None or size > len(self._room.value):
             self._packed.clear()
             return self._room(size, lambda: np.zeros((size, self._width)))
@@ -362,7 +364,7 @@ class Rows:
     def __call__(
         self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """Return the rows of the chosen points, the first of the memory of all; live: as `live` gives it."""
+        """Return the rows of the chosen points, at the start of the buffer.  `live` is the result of `live`."""
         if isinstance(chosen, slice):
             key = (data.key, chosen.start) if chosen.start else data.key
             rows, dofs = self._packed(key, lambda: self._pack(data, chosen))
@@ -376,7 +378,7 @@ class Rows:
         return rows
 
     def _pack(self, data: PointData, chosen: slice | NDArray[np.int64]) -> Packed:
-        """Return the rows with the fields that are constant while the points stay, and the dofs of grid functions."""
+        """Return rows with the fields that stay constant for the same points, and the dofs of grid functions."""
         cells = data.cells[chosen]
         rows, dofs = self.room(len(cells))[: len(cells)], []
         for columns, name in self._fixed:
@@ -388,17 +390,17 @@ class Rows:
 
 
 class PointForm:
-    """A form over `points.dx`: compiled once, assembled for any positions of the points.
+    """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
     Parameters
     ----------
     form
-        Linear or bilinear UFL form; all of its integrals are over `points.dx`.
+        Linear or bilinear UFL form; all integrals use `points.dx`.
     points
-        The points.
+        Points of the form.
     dense
-        Number the values of a DG0 test function by the cells that hold points, and not by all cells of the grid.
-        Kernels are then called for other cells, as in `PointExpression`: all cells must be equal.
+        Whether to number the values of a DG0 test function by the cells that contain points, in place of all cells.
+        Kernels are then called for other cells, as in `PointExpression`, so all cells must be equal.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -406,32 +408,32 @@ class PointForm:
         self._rows, self._bound = Rows(self.compiled, points), Latest()
 
     def _parts(self, data: PointData) -> Iterator[tuple]:
-        """Yield the form bound to one chunk of points after the other, with the coefficients of each chunk."""
+        """Yield for each chunk of points the form bound to their cells, and their rows of coefficients."""
         cells, live = data.places.slots if self._dense else data.cells, self._rows.live(data)
         bind = self.compiled.bind
         for part, form in self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))]):
             yield form, self._rows(data, part, live)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay in the ghost entries."""
+        """Add the vector to the local array `b`.  Contributions to ghosts remain in the ghost entries."""
         for form, rows in self._parts(data):
             self.compiled.assemble_vector(b, rows, form)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
-        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        """Add the matrix to `A`, with unrolled local dofs and without final assembly."""
         for form, rows in self._parts(data):
             self.compiled.assemble_matrix(A, rows, form)
 
 
 class FacetForm:
-    """A form over faces between active cells, or over active cells; compiled when a process first has one.
+    """A form over faces between active cells, or over active cells.  It is compiled once any process has one of these.
 
     Parameters
     ----------
     form
         Linear or bilinear UFL form over interior facets or cells.
     comm
-        The processes.
+        Communicator of the processes.
     """
 
     def __init__(self, form: ufl.Form, comm: MPI.Intracomm):
@@ -444,7 +446,7 @@ class FacetForm:
         return "compiled" in vars(self)
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
-        """Return the form over the facets of this process. The call is collective, because compilation is."""
+        """Return the form over these facets of this process; all processes must call this, because it may compile."""
         make = partial(FacetSum, self, facets)
         return self._last(facets, lambda: make(self._comm.allreduce(len(facets)) > 0), self._comm)
 
@@ -455,7 +457,7 @@ class FacetForm:
 
 
 class FacetSum:
-    """A form over some facets; some: whether any process has facets."""
+    """A form over some facets.  `some` tells whether any process has facets."""
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
         self._of = form
@@ -468,12 +470,12 @@ class FacetSum:
         return compiled.bind(self._facets) if len(self._facets) else None
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
-        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        """Add the matrix to `A`, with unrolled local dofs and without final assembly."""
         if self._bound is not None:
             self._of.compiled.assemble_matrix(A, None, self._bound)
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay in the ghost entries."""
+        """Add the vector to the local array `b`.  Contributions to ghosts remain in the ghost entries."""
         if self._bound is not None:
             self._of.compiled.assemble_vector(b, None, self._bound)
 
@@ -481,16 +483,16 @@ class FacetSum:
 class PointExpression:
     """A UFL expression of the fields of points, evaluated at every point.
 
-    The kernel depends on its cell by the cell's volume only, by which the result is divided. Gradients of grid
-    functions are therefore allowed only where all cells are equal. The kernel is called for as many arbitrary cells as
-    there are points. The DG0 test function then keeps one value for each point.
+    The kernel depends on the cell only through the cell's volume, and the result is divided by this volume.  Gradients
+    of grid functions are therefore allowed only if all cells are equal.  The kernel is called for as many arbitrary
+    cells as there are points, so that the DG0 test function yields one value for each point.
 
     Parameters
     ----------
     expression
         UFL expression of any shape in the fields of `points`.
     points
-        The points.
+        Points of the expression.
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
@@ -506,13 +508,13 @@ class PointExpression:
         self._grid = points.grid
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
-        """Return the present values of the fields that change while the points stay."""
+        """Return the current values of the fields that change between assemblies for the same points."""
         return self._rows.live(data)
 
     def evaluate(
         self, data: PointData, chosen: NDArray[np.int64] | None = None, live: dict[str, NDArray] | None = None
     ) -> NDArray[np.float64]:
-        """Return the values (m, *shape) at chosen points, by default all; live: the result of `live`, if known."""
+        """Return the values (m, *shape) at chosen points, by default all.  `live`: the result of `live`, if known."""
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)
         out, start = np.empty((count, self._values.shape[1])), 0
@@ -530,14 +532,14 @@ class PointExpression:
 
 
 class CellSums:
-    """Sums over the points of each cell: DG0 test functions make the assembler add them up.
+    """Sums over the points of each cell.  Through DG0 test functions the assembler adds them up.
 
     Parameters
     ----------
     quantities
         Scalar UFL expressions at the points.
     points
-        The points.
+        Points of the expressions.
     """
 
     def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
@@ -547,7 +549,7 @@ class CellSums:
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) in the cells that hold points."""
+        """Return the sums (cells, quantities) for the cells that contain points."""
         if not self._grid.even:
             sums = np.zeros((self._grid.num_local, self._count))
             self._form.assemble_vector(sums.reshape(-1), data)

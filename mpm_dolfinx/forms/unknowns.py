@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The unknowns of a step: their numbering, vectors and matrices.
 
-Functions live on the whole grid. Vectors, matrices and factors hold only the free degrees of freedom of active nodes or
-cells. The local-to-global map has -1 for all others, which PETSc ignores: dolfinx assembles straight into them.
+Functions are defined on the whole grid.  Vectors, matrices and factors contain only the free degrees of freedom of
+active nodes or cells.  In the local-to-global map all others have the number -1, which PETSc ignores.  dolfinx can
+therefore assemble directly into these vectors and matrices.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ class Unknowns:
     Parameters
     ----------
     function
-        Any function of the space, for its ghost pattern.
+        Any function of the space; its ghosts are used.
     dofs
         Unrolled local degrees of freedom that are unknowns, ghosts included.
     x : (entities, d), m
-        Positions of this process's nodes or cells; None: the space computes all of them on each request.
+        Positions of the nodes or cells of this process.  If None, the space computes all of them at each request.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
@@ -37,7 +38,7 @@ class Unknowns:
         owned = space.dofmap.index_map.size_local * space.dofmap.bs
         number = np.full(len(function.x.array), -1, dtype=np.int32)
         self.owned = dofs[dofs < owned]
-        """Unrolled local degrees of freedom of the entries of the vectors."""
+        """Unrolled local degree of freedom of each entry of a vector."""
         self.size = len(self.owned)
         start = 0
         if self.comm.size > 1:
@@ -53,22 +54,22 @@ class Unknowns:
 
     @property
     def dim(self) -> int:
-        """Degrees of freedom of a node or a cell."""
+        """Number of degrees of freedom of a node or a cell."""
         return self._space.dofmap.bs
 
     @property
     def nodes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Node and component of the entries of the vectors."""
+        """Node and component of each entry of a vector."""
         return np.divmod(self.owned, self.dim)
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Positions (n, d), m, of the entries of the vectors."""
+        """Position of each entry of a vector (n, d), m."""
         x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
         return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return a new vector with the given entries of this process."""
+        """Return a new vector with these entries on this process."""
         v = self.vector()
         v.array_w[:] = values
         return v
@@ -83,19 +84,19 @@ class Unknowns:
         return v
 
     def gather(self, values: NDArray[np.float64], out: PETSc.Vec) -> PETSc.Vec:
-        """Copy the entries of a local array on the whole grid into a vector."""
+        """Copy the entries for the unknowns from a local array over the whole grid into a vector."""
         out.array_w[:] = values[self.owned]
         return out
 
     def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
-        """Add scale * v to a function and update its ghosts; scale: one number, or one for each entry."""
+        """Add scale * v to a function, and update its ghosts.  `scale` is one number, or one for each entry."""
         values = function.x
         values.array[self.owned] += scale * v.array_r
         values.scatter_forward()
 
 
 def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:
-    """Return an empty sparse matrix for assembly, with room for `row_length` entries in each row."""
+    """Return an empty sparse matrix for assembly, with memory for `row_length` entries in each row."""
     A = PETSc.Mat().create(rows.comm)
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
@@ -108,30 +109,31 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
 
 
 def zero(A: PETSc.Mat) -> None:
-    """Set a matrix to zero before assembly, whether or not it has been assembled before."""
+    """Set a matrix to zero before assembly, also if it has never been assembled."""
     if A.assembled:
         A.zeroEntries()
 
 
 def collect_garbage(comm: MPI.Intracomm) -> None:
-    """Free the PETSc objects that Python has dropped on all processes. The call is collective.
+    """Free the PETSc objects that Python has released on all processes; all processes must call this function.
 
-    On several processes PETSc keeps dropped objects, because their order may differ between processes. Releases before
-    3.20 or so also keep the objects of a single process. Without this call a run keeps the matrices of all its steps.
+    On several processes PETSc keeps released objects, because the order of release may differ between processes.
+    Releases of PETSc before 3.20 or so also keep the objects of a single process.  Without this call a run keeps the
+    matrices of all its steps.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)
 
 
 def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
-    """Add the ghost contributions of other processes to the owned entries; return the function's local array."""
+    """Add the ghost entries of other processes to the owned entries; return the local array of the function."""
     if function.function_space.mesh.comm.size > 1:
         _compat.scatter_reverse_add(function)
     return function.x.array
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows (c, k) of the local dofs of a scalar space, with ghosts from their owners."""
+    """Return rows (c, k) for the local dofs of a scalar space, after an update of ghosts from their owners."""
     if space.mesh.comm.size == 1:
         return rows
     carrier, out = fem.Function(space), np.empty_like(rows)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The velocity of the solid in a substep, for forms that depend on it."""
+"""Velocity of the solid in a substep, for forms that depend on the velocity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Velocity:
-    """The velocity (u - past) / own at the end of a substep; in backward Euler past is 0 and own is the step's length.
+    """Velocity (u - past) / own at the end of a substep.  For backward Euler past = 0, and own is the step length.
 
     Parameters
     ----------
@@ -34,9 +34,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set the coefficients of the rate: own, the time increment, s, and past, a fraction of the present u.
-
-        dofs: the active degrees of freedom.
-        """
+        """Set own, the time increment (s), and past, a multiple of the current u, at the active dofs."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that follow a tool, or a function, from one reset of the grid to the next.
+"""Grid lines that follow a tool or a function, from one reset of the grid to the next.
 
-The number of lines never changes, and the sides of the grid stay.  Points carry the whole state over a reset, so lines
-may move between any two steps.
+The number of lines never changes, and the sides of the grid do not move.  Points carry the whole state over a reset of
+the grid, so lines may move between any two steps.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from mpm_dolfinx.base.validation import asked, called, check_names, line
 from mpm_dolfinx.grid.lines import checked, equal, rounding
 
 PLACES = ("t", "x")
-"""Names of the parameters of a function that gives lines."""
+"""Allowed parameters of a function that returns grid lines."""
 
 
 def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
-    """Refuse an object that lines cannot follow, and a grid without lines."""
+    """Raise an error for an object that lines cannot follow, and for a grid without lines."""
     if hasattr(follow, "pose"):
         if lines is not None and all(map(equal, checked(lines))):
             raise ValueError(f"grid: follow = {line(follow)}: all cells are equal, must be smaller around the tool")
@@ -38,9 +38,9 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
 def lines_at(
     follow: Any, given: Sequence[NDArray[np.float64]], t: float, x: NDArray[np.float64] | None
 ) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), m, along each axis, of a function at time t (s) and positions x (n, d), m.
+    """Return the lines (n,), m, along each axis, from a function of time t (s) and positions x (n, d), m.
 
-    given: true lines of the grid, whose numbers and ends they must have.
+    `given` are the true lines of the grid.  The new lines must have the same numbers and the same ends.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -56,41 +56,44 @@ def lines_at(
     return out
 
 
-def carried(lines: Sequence[NDArray[np.float64]], way: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return lines (n,), m, along each axis whose smallest cells have moved by a way (d,), m.
+def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return lines (n,), m, along each axis after the smallest cells have moved by a displacement `shift` (d,), m.
 
-    Edges between these cells and a side are multiplied by powers 1, 2 ... of a common factor, counted from the smallest
-    cells.  So they grow from there as before, but faster or slower.
+    Edges between the smallest cells and a side are multiplied by the powers 1, 2 ... of a common factor, counted from
+    the smallest cells.  They therefore grow from there as before, but faster or slower.
 
     Raises
     ------
     ValueError
-        Smallest cells at a side that they move along, or cells that would become smaller than these.
+        Smallest cells that touch a side and move along its normal; cells that would become smaller than the smallest.
     """
     out = []
-    for letter, x, gone in zip("xyz", lines, way.tolist(), strict=False):
+    for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):
         width = np.diff(x)
         small = np.flatnonzero(width <= width.min() * (1 + SAME))
         first, last = small[0], small[-1] + 1
-        if gone == 0 or last - first == len(width):
+        if step == 0 or last - first == len(width):
             out.append(x)
             continue
-        low = _filled(width[:first][::-1], x[first] - x[0], gone, width.min(), letter)
-        high = _filled(width[last:], x[-1] - x[last], -gone, width.min(), letter)
-        small = x[first : last + 1] + gone
+        low = _filled(width[:first][::-1], x[first] - x[0], step, width.min(), letter)
+        high = _filled(width[last:], x[-1] - x[last], -step, width.min(), letter)
+        small = x[first : last + 1] + step
         new = np.concatenate([small[0] - np.cumsum(low)[::-1], small, small[-1] + np.cumsum(high)])
         new[0], new[-1] = x[0], x[-1]
         out.append(new)
     return out
 
 
-def _filled(width: NDArray[np.float64], room: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
-    """Return edges (n,), m, from the smallest cells to a side, with more room, m; least: smallest edge, m."""
+def _filled(width: NDArray[np.float64], length: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
+    """Return edges (n,), m, from the smallest cells to a side, after the distance grows by `more`, m.
+
+    `width` are the edges before, `length` the distance before, `least` the smallest edge, m.
+    """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):
         raise ValueError(f"{what}, but its cells begin at a side: lines must have larger cells on both sides")
     power = np.arange(1, len(width) + 1)
-    total = room + more
+    total = length + more
     if total < len(width) * least * (1 - SAME):
         allowed = f"must stay {len(width) * least:.3g} m away for {len(width)} cells, none smaller than its own"
         raise ValueError(f"{what}, its cells are {total:.3g} m from a side, {allowed}")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-Points are located in equal cells by arithmetic, in other grids by a search along each axis.  Cell sizes come from
-`sizes`, `volumes` and similar methods.  For equal cells these return a single row, `h`, or a single number.
+Points are located in equal cells by arithmetic, in other grids by a search along each axis.  Methods such as `sizes`
+and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
 
-The mesh is made at its first use.  By then a simulation has distributed the cells by the number of points in them.
+The mesh is created at its first use.  By then a simulation has distributed the cells by the number of points in them.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
-"""Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
-REACH = 1e-4  # cells: tolerance for bodies beyond the grid, as a penalty moves a side onto a wall with this error
+"""Axis and end of each side of a box: (axis, 0 for the lower or 1 for the upper end)."""
+REACH = 1e-4  # cells: bodies may lie outside the grid by this distance, by which a penalty misses a wall
 
 TURN = 2 * np.pi
-"""Angle of the revolution of axisymmetric volumes, forces and outflows.  Source: definition."""
+"""Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
-"""Rows processed at a time, to bound the size of temporary arrays."""
+"""Number of rows that are processed together, which limits the size of temporary arrays."""
 MOST = 2**31 - 1
 """Largest number of unknowns for PETSc's 32-bit integers."""
 SNAP = 1e-10
-"""Cells: distance to a grid plane below which a vertex lies on it, if rounding is smaller; below any visible effect."""
+"""Distance to a grid plane, in cells, below which a vertex lies on the plane, unless rounding errors are larger."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
-    """Return (axis, end) of a side of a box by its name."""
+    """Return (axis, end) of a side of a box, by name."""
     if not isinstance(name, str) or name not in SIDES[dim]:
         raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
     return SIDES[dim][name]
@@ -58,29 +58,29 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) by index (n,), always as floats, unlike numpy's bincount."""
+    """Return the sums (..., size) of values (..., n) by index (n,), as floats (`np.bincount` may return ints)."""
     if values.ndim > 1:
-        rows = values.reshape(int(np.prod(values.shape[:-1])), len(index))  # there may be none
+        rows = values.reshape(int(np.prod(values.shape[:-1])), len(index))  # also for no rows
         index, whole = (index + size * np.arange(len(rows))[:, None]).ravel(), size * len(rows)
         return sum_by(index, rows.ravel(), whole).reshape(*values.shape[:-1], size)
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all numbers (n,) of ranges (m,) given by first number and count, and the range (n,) of each number."""
+    """Return all numbers (n,) of m ranges, given by first number and count, and the range of each number (n,)."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) occur in sorted `chosen` (m,), without the large tables of numpy's isin."""
+    """Return which numbers (...) occur in sorted `chosen` (m,), without the large tables of numpy's `isin`."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return the edges normal to a face, m, of its "+" and "-" cells, and their mean, as UFL; n: face normal."""
+    """Return the edges normal to a face of its "+" and "-" cells, and their mean, m, as UFL; n is the face normal."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -89,15 +89,15 @@ def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
 
 
 class CellPlaces(NamedTuple):
-    """Nodes (nodes, d) and midpoints (cells, d) from the grid's base, m; edges (cells, d), m, None for equal cells."""
+    """Positions of nodes and cells relative to the base of the grid."""
 
-    node_x: NDArray[np.float64]
-    midpoints: NDArray[np.float64]
-    sizes: NDArray[np.float64] | None
+    node_x: NDArray[np.float64]  # nodes (nodes, d), m
+    midpoints: NDArray[np.float64]  # midpoints of cells (cells, d), m
+    sizes: NDArray[np.float64] | None  # edges of cells (cells, d), m; None for equal cells
 
 
 class Spacing(NamedTuple):
-    """The lines of a grid, and what depends on them; see the attributes of `Grid`."""
+    """The lines of a grid, and quantities that depend on the lines; see the attributes of `Grid`."""
 
     lines: tuple[NDArray[np.float64], ...]
     widths: tuple[NDArray[np.float64], ...]
@@ -110,10 +110,16 @@ class Spacing(NamedTuple):
 class Cells:
     """The cells of a grid on this process, ghosts included, in the numbering of the mesh.
 
-    num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): nodes in the numbering of Q1
-    degrees of freedom; at: present positions; signs (2^d, d): direction from the midpoint to each node; cell_number
-    (cells,): lexicographic numbers; locals: the inverse of it, -1 for cells of other processes; owners: rank of each
-    cell, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 on the boundary.
+    num_owned, num_local
+        Number of cells without and with ghosts.
+    cell_nodes, signs
+        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from the midpoint to each (2^d, d).
+    at
+        Current positions.
+    cell_number, locals, owners
+        Lexicographic number of each local cell; local index of each cell, or -1; rank of each cell, copy by copy.
+    cell_facets, facet_cells
+        Facets of each cell (cells, 2d); cells at each facet (facets, 2), -1 outside the boundary.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -127,7 +133,7 @@ class Cells:
         corners = node_x[self.cell_nodes]
         midpoints = corners.mean(axis=1)
         # all cells list their vertices in the same order (tested), so all processes compile the same forms, even a
-        # process without a cell
+        # process without cells
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - midpoints[:1, None])))[0]
         self.cell_number = grid.number(grid.index_from_base(midpoints))
         if grid.copies > 1:
@@ -140,7 +146,7 @@ class Cells:
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
-        if d == 3 and grid.comm.size > 1:  # collective: a process without facets would never call it
+        if d == 3 and grid.comm.size > 1:  # all processes must call this, also without facets
             topology.create_entity_permutations()
         self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
         adjacency = topology.connectivity(d - 1, d)
@@ -150,7 +156,7 @@ class Cells:
         self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
         self.facets_owned = topology.index_map(d - 1).size_local
         self.cellwise = cache(partial(_compat.function_space, mesh, "DG", 0))
-        """Function spaces by value shape, each made once, and one function of each shape with shared memory."""
+        """Function spaces by value shape, each created once.  All functions of a shape share memory."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
         self.move(grid)
 
@@ -162,7 +168,7 @@ class Cells:
         return out
 
     def move(self, grid: Grid) -> None:
-        """Move mesh, nodes and cells to the lines of a grid that follows; positions depend on nothing else."""
+        """Move mesh, nodes and cells to the current lines of the grid.  Their positions depend on nothing else."""
         if grid.follow is None:
             return
         node_x, x = map(grid.places, self._index)
@@ -173,17 +179,17 @@ class Cells:
 
 
 def of_cells(name: str) -> cached_property:
-    """Return a property of a grid that is an attribute of its `Cells`, which are made once."""
+    """Return a property of a grid that is an attribute of its `Cells`."""
     return cached_property(lambda grid: getattr(grid._of_process, name))
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid that reads present positions of its `Cells`."""
+    """Return a property of a grid that is a current position in its `Cells`."""
     return property(lambda grid: getattr(grid._of_process.at, name))
 
 
 def of_spacing(name: str) -> property:
-    """Return a property of a grid that depends on its present lines, see `Spacing`."""
+    """Return a property of a grid that depends on its current lines, see `Spacing`."""
     return property(lambda grid: getattr(grid._spacing, name))
 
 
@@ -191,7 +197,7 @@ class Grid:
     """Background grid over the box [lower, upper], with equal cells or with cells between given lines.
 
     Bodies must stay inside.  Empty cells cost next to nothing.  The sides of the grid are the walls of a scene: "left",
-    "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
+    "right" (x), "bottom", "top" (y in 2D, z in 3D), and in 3D "front", "back" (y).
 
     Parameters
     ----------
@@ -202,43 +208,43 @@ class Grid:
     comm
         Processes that share the grid.
     lines : (n,) along each axis, m
-        Ascending coordinates of all grid lines, instead of `lower`, `upper` and `cells`; see `graded`.  Lines of equal
-        spacing along all axes give the grid of equal cells.
+        Ascending coordinates of all grid lines, instead of `lower`, `upper` and `cells`; see `graded`.  Equally spaced
+        lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
-        What the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move as the tool
-        does, and the cells around them widen and narrow.  A function of the time t (s) and positions x (n, d) of all
-        points, by these names, returns as many lines, between the same sides.
+        Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
+        the tool, and the cells around them widen or narrow.  A function of time t (s) and positions x (n, d) of all
+        points (parameters t, x or both) returns the same number of lines, between the same sides.
     axisymmetric
-        The first axis is the radius r >= 0, the second the axis of revolution.  The scene has no torsion.  Volumes,
-        forces and outflows belong to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side
-        "left" is the axis and has no radial displacement.
+        The first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes, forces
+        and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is
+        the axis, where radial displacements are zero.
 
     Raises
     ------
     ValueError
-        Corners or lines that are not finite or not ascending, numbers of cells that are not integers >= 1, more nodes
-        than PETSc can number, an axisymmetric grid in 3D or with r < 0, or `follow` without lines.
+        Corners or lines are not finite or not ascending; numbers of cells are not integers >= 1; PETSc cannot number
+        the nodes; an axisymmetric grid is in 3D or has r < 0; `follow` is given without lines.
 
     Attributes
     ----------
     dim, shape, lower, upper
         d; number of cells along each axis (d,); corners (d,), m.
     even, lines, widths
-        Whether all cells are equal; present lines (n,), m, along each axis, relative to `base`; edges (n - 1,), m,
-        along each axis.
+        Whether all cells are equal; current lines (n,) along each axis, relative to `base`, m; edges (n - 1,) along
+        each axis, m.
     finest, least, most
-        Shortest edges (d,), m, along each axis; shortest and longest edge of a cell, m.
+        Shortest edge along each axis (d,), m; shortest and longest edge of all cells, m.
     snap
-        Distance (d,) to a grid plane along each axis, in cells, below which a vertex lies on the plane.
+        Distance to a grid plane along each axis (d,), in cells, below which a vertex lies on the plane.
     base, low, high
-        Origin (d,), m, of all internal positions of bodies, which keeps their digits far from the true origin: the
-        lower corner, with a radius of 0 in axisymmetry; and the corners relative to it.
+        Origin (d,), m, of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  It preserves
+        digits of positions far from the true origin.  Lower and upper corner relative to `base`.
     stretches
-        Dimension of deformation gradients: d, in axisymmetry 3, with the circumferential stretch as the third.
+        Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
     mesh
-        The dolfinx mesh, with coordinates relative to `base`, made at its first use.  On several processes, a second
-        scene with another distribution of points has its own mesh and grid, `Simulation.grid`.  Scenes with terms or
-        sources always keep this mesh, because these may be defined on it.
+        The dolfinx mesh, with coordinates relative to `base`, created at its first use.  On several processes, a second
+        scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  Scenes with terms or
+        sources always keep this mesh, because terms may be defined on it.
     """
 
     def __init__(
@@ -284,17 +290,17 @@ class Grid:
         self.low, self.high = self.lower - self.base, self.upper - self.base
         self._h = (self.upper - self.lower) / self.shape if self.even else None
         self.seeded: tuple[NDArray[np.float64], ...] | None = None if self.even else self.from_base(lines)
-        """Lines (n,), m, along each axis as given, relative to the base, on which bodies are seeded."""
+        """Lines as given, relative to the base (n,), m, along each axis.  Bodies are seeded on these lines."""
         self._spacing = self._spaced(self.seeded)
         self.comm = comm
         self._cells: Cells | None = None
 
     def from_base(self, lines: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
-        """Return true lines (n,), m, along each axis, relative to the base."""
+        """Return true lines (n,), m, along each axis as coordinates relative to the base."""
         return tuple(x - start for x, start in zip(lines, self.base, strict=True))
 
     def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
-        """Return lines relative to the base, None for equal cells, and what depends on them."""
+        """Return the spacing for lines relative to the base, or for equal cells if None."""
         finest, most = self._h, self._h
         if lines is None:
             lines = tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self._h, strict=True))
@@ -305,9 +311,9 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
-        """Move the lines of a grid that follows to these (n,), m, along each axis, relative to the base.
+        """Move the lines of a grid that follows to new coordinates (n,), m, along each axis, relative to the base.
 
-        All positions then are those of a grid made with these lines, whatever the lines were before.
+        Afterwards all positions equal the positions in a new grid with these lines, for any earlier lines.
         """
         if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
             self._spacing = self._spaced(tuple(lines))
@@ -326,7 +332,7 @@ class Grid:
 
     @cached_property
     def cell_volume(self) -> float:
-        """Volume, m^d, of equal cells; in axisymmetry the area in the plane."""
+        """Volume of equal cells, m^d; in axisymmetry the area in the plane."""
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
@@ -334,7 +340,7 @@ class Grid:
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edges (n,), m, of local cells (n,) along one axis, or along an axis for each (n,)."""
+        """Return the edges (n,), m, of local cells (n,) along one axis, or along a different axis for each cell."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
@@ -342,27 +348,27 @@ class Grid:
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes (n,), m^d, of local cells, in axisymmetry in the plane; one number for equal cells."""
+        """Return the volumes (n,), m^d, of local cells, in axisymmetry plane areas; one number for equal cells."""
         return self.cell_volume if self.even else self._of_process.at.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return volume over longest edge of local cells (n,), m^(d-1); one number for equal cells."""
+        """Return the volume divided by the longest edge of local cells (n,), m^(d-1); one number for equal cells."""
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of cells by lexicographic number; one row (d,) for equal cells."""
+        """Return the edges (n, d), m, of cells with lexicographic numbers (n,); one row (d,) for equal cells."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edges (..., d), m, of the cells at positions (..., d), m, from the base; (d,) for equal cells."""
+        """Return the edges (..., d), m, of cells at positions x (..., d), m, from the base; (d,) for equal cells."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions (..., d), m, from the base in units of cells from the lower corner."""
+        """Return positions (..., d) in units of cells from the lower corner, for positions x in m from the base."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -372,15 +378,15 @@ class Grid:
         return out
 
     def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return distances >= 0 in units of cells, along each axis, between positions (..., d), m, from the base."""
+        """Return distances (..., d) >= 0 along the axes, in units of cells, between positions x and y from the base."""
         if self.even:
             return np.abs((y - x) / self._h)
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return positions (n, d), m, from the base: cell index plus a fraction of the cell from its lower corner.
+        """Return positions (n, d), m, from the base: the lower corner of a cell plus a fraction `share` of the cell.
 
-        Indices (n, d) beyond the grid refer to cells of the size of the last one.
+        Indices (n, d) outside the grid refer to cells with the size of the outermost cell.
         """
         if self.even:
             return self.low + (index + share) * self._h
@@ -392,7 +398,7 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Return the edges (d,), m, of the cell as UFL; a constant for equal cells."""
+        """Return the edges (d,), m, of the cell as a UFL coefficient; a constant for equal cells."""
         return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -400,17 +406,17 @@ class Grid:
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of cells by indices (n, d) along the axes; one row (d,) for equal cells."""
+        """Return the edges (n, d), m, of cells with indices (n, d) along the axes; one row (d,) for equal cells."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,), m, above coordinates (n,) in a grid of unequal cells; inf above the last one."""
+        """Return the next line (n,), m, above coordinates x (n,) along an axis of unequal cells; inf above the last."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of cells at coordinates, m, along an axis of unequal cells, clamped into the grid."""
+        """Return the indices of cells at coordinates x, m, along an axis of unequal cells, limited to the grid."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -428,25 +434,25 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells of this process; distributed evenly if no scene has distributed them before."""
+        """The cells of this process; they are distributed evenly if no scene has distributed them."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Make the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
+        """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
         if self._cells is None:
             self._cells = self._made(owners(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return a grid with cells distributed by their loads (cells,): this grid, or an equal one with another mesh.
+        """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
 
         Parameters
         ----------
         load : (cells,)
             Load of each cell, such as its number of points, >= 0.
         keep
-            Keep an existing mesh whatever its distribution, because other objects were made on it.
+            Keep an existing mesh for any distribution, because other objects were created on this mesh.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -458,7 +464,7 @@ class Grid:
         return self
 
     def _made(self, owner: NDArray[np.int32]) -> Cells:
-        """Return the cells and their mesh; owner: rank of each cell of one copy, of the grid's shape."""
+        """Create the mesh, and return its cells.  `owner` is the rank of each cell, with the shape of the grid."""
         own = (owner.ravel() == self.comm.rank).nonzero()[0]
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
         ranks, first = destinations(owner, own)
@@ -474,7 +480,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
     def _nodes(self) -> NDArray[np.float64]:
-        """Return the positions (n, d), m, of this process's share of the nodes, in lexicographic order."""
+        """Return the positions (n, d), m, of the nodes that this process contributes, in lexicographic order."""
         count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
@@ -496,20 +502,20 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return the number of the first cell of the copy of each material point (n,), given by id."""
+        """Return, for material points with these ids (n,), the number of the first cell of their copy of the box."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
-        """Return the space of cellwise constant functions (DG0) of a value shape, made once."""
+        """Return the space of cellwise constant functions (DG0) with a value shape; it is created once."""
         return self._of_process.cellwise(shape)
 
     def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
-        """Return a new cellwise function for coefficients of forms; all functions of a shape share their memory."""
+        """Return a new cellwise function as a coefficient of forms.  All functions of a shape share their memory."""
         return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
     @property
     def given(self) -> dict[str, Any]:
-        """Arguments that make an equal grid: corners and numbers of cells, or lines."""
+        """Arguments of an equal grid: corners and numbers of cells, or lines."""
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape}
         return {"lines": [x + start for x, start in zip(self.seeded, self.base, strict=True)], "follow": self.follow}
@@ -525,46 +531,46 @@ class Grid:
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the factor of measures in the plane at positions (n, d), m: 2 pi r (n,), m, in axisymmetry, else 1."""
+        """Return the factor from plane to volume integrals at x (n, d), m: 2 pi r (n,), m, in axisymmetry, else 1."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic numbers of cells, in the first copy, from their indices (n, d) along the axes."""
+        """Return the lexicographic numbers (n,), in the first copy, of cells with indices (n, d) along the axes."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the cells at true positions (n, d), m, clamped into the grid."""
+        """Return the indices (n, d) of the cells at true positions x (n, d), m, limited to the grid."""
         return self.index_from_base(x - self.base)
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the cells at positions (n, d), m, from the base, clamped into the grid."""
+        """Return the indices (n, d) of the cells at positions x (n, d), m, from the base, limited to the grid."""
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
         return np.minimum(np.maximum(i, 0), self.shape - 1, out=i)
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the rank that owns each cell, given by lexicographic number."""
+        """Return the rank that owns each cell with a lexicographic number."""
         return self.owners[number]
 
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the local index of each cell, given by lexicographic number; -1 for cells of other processes."""
+        """Return the local index of each cell with a lexicographic number; -1 for cells of other processes."""
         return self.locals[number]
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes and the copy (n, d + 1) of local nodes (n,)."""
+        """Return the indices along the axes and the number of the copy (n, d + 1) of local nodes (n,)."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes and the copy (n, d + 1) of local cells (n,)."""
+        """Return the indices along the axes and the number of the copy (n, d + 1) of local cells (n,)."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if this process has none."""
+        """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if not on this process."""
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
@@ -574,22 +580,22 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which positions, from the base, lie outside the grid by more than `tolerance` cells plus rounding."""
+        """Return which positions x from the base lie outside the grid by more than `tolerance` cells plus rounding."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
         for a in range(self.dim):
             y = (x[:, a] - self.low[a]) / self.h[a] if self.even else cells[:, a]
             inside &= (y >= -tolerance[a]) & (y <= self.shape[a] + tolerance[a])
-        return ~inside  # nan is outside as well
+        return ~inside  # nan counts as outside
 
     def shape_gradients(
         self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points.
+        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
 
-        mixed (n, 3), m^2: in 3D, mean products of the offsets in cut subdomains about these points; gradients are then
-        means over the subdomains.
+        `mixed` (n, 3), m^2, in 3D, are mean products of offsets in subdomains about these points.  With them, gradients
+        are means over the subdomains.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -604,27 +610,27 @@ class Grid:
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
-        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one column each.
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell; one column for each function.
 
-        Row s belongs to the product of the offsets along the axes of the bits of s.  For unequal cells the offsets are
-        in units of the edges, see `over_edges`.
+        Row s is the factor of the product of the offsets along all axes whose bit is set in s.  For unequal cells, the
+        offsets are in units of the edges, see `over_edges`.
         """
         bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Return coefficients by `monomials` (d, 2^d, cells), converted to offsets in m; unchanged for equal cells."""
+        """Convert coefficients (d, 2^d, cells) of `monomials` to offsets in m; for equal cells they are unchanged."""
         if self.even:
             return coefficients
         bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
         return coefficients / np.where(bits, self.sizes(cells), 1.0).prod(axis=2)
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 shape functions (n, 2^d) of local cells at points."""
+        """Return the Q1 shape functions (n, 2^d) of local cells at points x."""
         return reduce(np.multiply, self._hats(cells, x))
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of a Q1 field u (nodes, k) at points (n, d), m, in local cells (n,)."""
+        """Return the values of a Q1 field u (nodes, k) at points x (n, d), m, in local cells (n,)."""
         out = np.empty((len(x), u.shape[1]))
         for part in in_chunks(len(x)):
             N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]
@@ -632,35 +638,36 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the linear factors (n, 2^d) of the shape functions, one for each axis."""
+        """Return the factors (n, 2^d) of the shape functions, which are linear, for each axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets owned by this process between two active cells; cells: the active ones."""
+        """Return the facets of this process between two active cells.  `cells` are the active cells."""
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
         both = self.facet_cells[facets]
         return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
 
     def wall_nodes(self, name: str) -> NDArray[np.bool_]:
-        """Return which nodes lie on a side of the box."""
+        """Return which nodes lie on a side of the box, given by name."""
         axis, end = side(name, self.dim)
         plane = (self.low, self.high)[end][axis]
         return np.abs(self.node_x[:, axis] - plane) < NEAR * self.finest[axis]
 
 
 class GridOfGroups(Grid):
-    """A grid with a copy of its box for each contact group, so that groups share no nodes.
+    """A grid with a separate copy of the box for each contact group, so that groups share no nodes.
 
-    The mesh consists of disconnected boxes at the same position.  Equal cells of the copies belong to one process.
+    The mesh consists of disconnected boxes at the same position.  The same process owns corresponding cells of all
+    copies.
 
     Parameters
     ----------
     grid
         Grid of the bodies.
     group : (points,)
-        Group of each material point of the scene, by id, counted from 0.
+        Group of each material point of the scene, in the order of ids, counted from 0.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):
@@ -676,5 +683,5 @@ class GridOfGroups(Grid):
         return self._copies
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of the first cell of the copy of each material point (n,), given by id."""
+        """Return, for material points with these ids (n,), the number of the first cell of their copy of the box."""
         return self._group[ids] * np.int64(self.cells)

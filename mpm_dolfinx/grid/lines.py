@@ -14,14 +14,14 @@ from mpm_dolfinx.base.validation import line, numbers
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the possible rounding error, m, of coordinates of this size."""
+    """Return the largest rounding error, m, of coordinates like x."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
 def checked(lines: Sequence[ArrayLike]) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), m, along two or three axes; ValueError for invalid ones."""
+    """Return the grid lines (n,), m, along two or three axes; raise ValueError if they are invalid."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
-        raise ValueError(f"grid: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one an axis")
+        raise ValueError(f"grid: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
     out = []
     for letter, places in zip("xyz", lines, strict=False):
         allowed = "at least 2 finite coordinates, each > the one before"
@@ -48,20 +48,20 @@ def graded(
     ratio: float = 1.1,
     largest: float = np.inf,
 ) -> list[NDArray[np.float64]]:
-    """Return grid lines with small cells in fine boxes that grow away from the boxes.
+    """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance.
 
-    Lines cross the whole grid, so cells next to a fine box along an axis are as narrow as the cells inside.
+    Lines cross the whole grid.  Cells beside a fine box, along an axis, are therefore as narrow as the cells inside.
 
     Parameters
     ----------
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of the fine boxes, at least one, inside the grid.
+        Lower and upper corners of the fine boxes, at least one box, inside the grid.
     size : number or (d,), m
-        Largest edges of the small cells, > 0; a whole number of cells fits each box.
+        Largest edges of the small cells, > 0.  Each box contains a whole number of cells.
     ratio
-        Largest ratio of neighbouring edges, > 1, if there is room for it.
+        Largest ratio of neighbouring edges, > 1; it is exceeded if there is not enough space.
     largest : m
         Largest edge of a cell, >= size.
 
@@ -95,7 +95,7 @@ def graded(
 def _along(
     low: float, high: float, fine: NDArray[np.float64], size: float, ratio: float, largest: float
 ) -> NDArray[np.float64]:
-    """Return the lines (n,), m, from low to high; fine (k, 2): intervals of small cells, m."""
+    """Return the lines (n,), m, from low to high along an axis.  `fine` (k, 2) are the intervals of small cells, m."""
     joined: list[list[float]] = []
     for start, stop in sorted(fine.tolist()):
         if joined and start <= joined[-1][1] + SAME * size:
@@ -124,7 +124,7 @@ def _along(
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
     """Return edges (n,), m, that fill a gap, m, with a common growth factor of at most `ratio`, starting near `size`.
 
-    Of the two possible numbers of edges, the one with the factor nearest to one is taken.
+    Two numbers of edges are possible; the one with the growth factor nearest to 1 is used.
     """
     if gap <= 0:
         return np.empty(0)

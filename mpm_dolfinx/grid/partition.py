@@ -2,8 +2,8 @@
 """Partition of the grid's cells among processes: recursive coordinate bisection, weighted by loads.
 
 dolfinx's partitioners distribute the whole background grid.  Most of its cells are empty, so one process might hold the
-whole body.  Here the box is bisected recursively across the longest extent of its load, into halves of equal load.
-Cuts are planes between cells (Berger and Bokhari 1987).
+whole body.  Here the box is bisected recursively, across the longest extent of the filled cells, into halves of equal
+load.  The two halves are separated by a plane between cells (Berger and Bokhari 1987).
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 EMPTY = 1e-2
-"""Weight of an empty cell / weight of an average filled cell: its remaining share of memory and time."""
+"""Weight of an empty cell divided by the mean weight of a filled cell, for memory and time that empty cells need."""
 
 
 def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
-    """Return the owner rank of each cell, as an array of the grid's shape.
+    """Return the owner rank of each cell, as an array with the shape of the grid.
 
     Parameters
     ----------
@@ -33,20 +33,20 @@ def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Distribute a box of cells among `count` ranks from `first` on; the arrays are views of the whole grid's arrays.
+    """Distribute a box of cells among `count` ranks, starting at rank `first`.  Arrays are views of the whole grid's.
 
-    Each rank has at least one cell if there are enough; this has priority over equal loads.
+    If there are enough cells, each rank gets at least one; this has priority over equal loads.
     """
     out[...] = first
     if count == 1 or weight.size == 1:
         return
     axis = int(np.argmax([_extent(filled, a) if filled.any() else n for a, n in enumerate(weight.shape)]))
     layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    if len(layers) == 1:  # the load is in one layer
+    if len(layers) == 1:  # all filled cells lie in one layer
         axis = int(np.argmax(weight.shape))
         layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
     cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
-    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless some stay idle
+    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless ranks stay idle
     even = (ranks == count // 2) | (ranks != count // 2).all()
     off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
     plane = int(np.argmin(np.where(even, off, np.inf)))
@@ -64,14 +64,14 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the ranks that hold each of some cells, owner first, and the offsets of each cell's list.
+    """Return the ranks that hold each of some cells, the owner first, and the offset of each cell's list of ranks.
 
-    Neighbours across faces hold a cell as a ghost.
+    Processes that own a neighbour across a face hold the cell as a ghost.
 
     Parameters
     ----------
     owner
-        Owner rank of each cell, of the grid's shape.
+        Owner rank of each cell, with the shape of the grid.
     cells : (n,)
         Lexicographic numbers of the cells.
     """

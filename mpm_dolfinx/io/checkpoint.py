@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints: an interrupted run is resumed from a file, on any number of processes.
+"""Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
-A checkpoint is a numpy archive of the state between two steps (`State`). A description in it identifies the scene.
+A checkpoint is a numpy archive of the state between two steps (`State`).  A description in the archive identifies the
+scene.
 """
 
 from __future__ import annotations
@@ -29,36 +30,37 @@ from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
-from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.state import State, Stay, Trend
 from mpm_dolfinx.stepping.step_memory import StepControl
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 12  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 13  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
-LEAVE = ("pressure", "slope", "bounds")  # of pieces, not stored when they are cut again
-NODAL = ("velocity", "held", "rest")  # fields of a State
-NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their types
+LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if domains will be cut again
+NODAL = ("velocity", "held", "rest")  # nodal fields of a State
+# metadata of a checkpoint, with their types
+NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}
 
 
 @dataclass
 class Checkpoint:
-    """Saves a run at intervals and at its end: the `checkpoint` of `Simulation.run`.
+    """Saves a run at intervals and at the end, if passed as `checkpoint` to `Simulation.run`.
 
     Parameters
     ----------
     file
-        The file, for `resume`. A complete new file replaces the old one.
+        The file to be written, for `resume`.  A new file replaces the old one when it is complete.
     every
-        Output intervals between two checkpoints, >= 1.
+        Number of output intervals between two checkpoints, >= 1.
     seconds
-        Least wall time between two checkpoints, s, >= 0.
+        Shortest wall time between two checkpoints, s, >= 0.
 
     Raises
     ------
     ValueError
-        An argument out of its range.
+        An argument is out of range.
     OSError
-        The file cannot be written; raised during the run. The previous checkpoint stays intact.
+        The file cannot be written; raised during the run.  The previous checkpoint remains intact.
     """
 
     file: str | os.PathLike
@@ -73,7 +75,7 @@ class Checkpoint:
         numbers("checkpoint: seconds", self.seconds, test=lambda v: v >= 0, allowed=">= 0")
 
     def __call__(self, simulation: Simulation) -> None:
-        """Save the state if a checkpoint is due."""
+        """Save the state if the output interval and the wall time require a checkpoint."""
         result, comm = simulation.result, simulation.grid.comm
         writes = (len(result.rows) - 1) % self.every == 0
         if writes and self.seconds > 0:
@@ -84,7 +86,7 @@ class Checkpoint:
 
 
 def save(simulation: Simulation, file: Path) -> None:
-    """Write the state of a simulation between two steps of a run."""
+    """Write the state of a simulation between two steps of a run to a file."""
     comm = simulation.grid.comm
     start = time.perf_counter()
     state = simulation.state
@@ -109,24 +111,24 @@ def save(simulation: Simulation, file: Path) -> None:
 
 
 def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
-    """Restore a simulation from a checkpoint; return its result so far, which continues by `run(after=...)`.
+    """Restore a simulation from a checkpoint; return the result so far, from which `run(after=...)` continues.
 
     Parameters
     ----------
     simulation
-        The scene of the checkpoint, on any number of processes. Call its `stage` first, to bring it to the stage of the
-        checkpoint. Grid, bodies, materials with their fields and laws, and fluid must agree with the file. Loads,
-        boundary conditions, terms and sources may differ. Data that observers have gathered are not in the file.
+        The scene of the checkpoint, on any number of processes.  First call `stage`, to bring the scene to the stage of
+        the checkpoint.  Grid, bodies, materials with their fields and laws, and fluid must agree with the file.  Loads,
+        boundary conditions, terms and sources may differ.  Data that observers have collected are not in the file.
     file
         The checkpoint.
 
     Raises
     ------
     ValueError
-        The file is not a complete checkpoint, or belongs to another scene; the message says why. The simulation is
-        unchanged.
+        The file is not a complete checkpoint, or belongs to another scene; the message gives the reason.  The
+        simulation is not changed.
     OSError
-        The file does not exist (FileNotFoundError) or cannot be read.
+        The file does not exist (FileNotFoundError), or cannot be read.
     """
     instance("resume: simulation", simulation, Simulation)
     file, comm = path("checkpoint: file", file), simulation.grid.comm
@@ -138,7 +140,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
         found.append(_state(file, arrays, note, simulation))
         return _without_rows(found[0])
 
-    found: list[State] = []  # rank 0 reads all rows and sends them to their owners
+    found: list[State] = []  # rank 0 reads all points and pieces, and sends them to their owners
     bare = at_root(comm, read)
     state = found[0] if found else bare
     nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
@@ -154,7 +156,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return the arrays of a state by name, with slashes for nested dictionaries."""
+    """Return all arrays of a state by name, with slashes for nested dictionaries."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -166,6 +168,8 @@ def _arrays(state: State) -> dict[str, NDArray]:
         named["pieces"] = state.pieces.arrays
     if state.lines is not None:
         named["lines"] = state.lines
+    if state.trend is not None:
+        named["trend"] = vars(state.trend)
     if state.stay is not None:
         named["stay"] = {"points": vars(state.stay.points)}
         if state.stay.keeps is not None:
@@ -174,10 +178,10 @@ def _arrays(state: State) -> dict[str, NDArray]:
 
 
 def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation) -> State:
-    """Return the complete state in a file; ValueError if it does not fit the simulation."""
+    """Return the complete state in a file; raise ValueError if it does not fit the simulation."""
     now, dim = simulation.state, simulation.grid.dim
     wet, damaged = simulation.scene.fluid is not None, f"{file}: is cut short or damaged"
-    ids, total = simulation.scene.all_ids(now.stage.present), sum(map(len, simulation.bodies))
+    ids, total = simulation.scene.ids(now.stage.present), sum(map(len, simulation.bodies))
     try:
         points = _points(_part(arrays, "points/"), now.points, ids, total)
         stay = None
@@ -195,6 +199,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
                 raise ValueError("pieces: of_cell, start: do not fit the kept cut")
+        of_trend = _part(arrays, "trend/")
+        trend = Trend(**of_trend) if of_trend else None
+        if trend is not None:
+            _check_trend(trend, points)
         lines = _part(arrays, "lines/") or None
         if lines is not None:
             _check_lines(lines, simulation.grid)
@@ -219,6 +227,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             outcome=_like(outcome, now.outcome),
             stage=None,
             begins=note["begins"],
+            trend=trend,
             result=result,
             control=control,
             **dict(zip(NODAL, nodal, strict=True)),
@@ -228,7 +237,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
 
 
 def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str, NDArray]]]:
-    """Return the outcomes of the conditions at each of `count` output times."""
+    """Return the results of the conditions at each of `count` output times."""
     out: list[dict[str, dict[str, NDArray]]] = [{} for _ in range(count)]
     for quantity, names in _nested(arrays).items():
         for name, found in names.items():
@@ -238,9 +247,9 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return a stored outcome, reduced to the present conditions; a condition that is new keeps its present outcome.
+    """Return the stored results of the current conditions; a condition that is new keeps its current results.
 
-    Raises ValueError for other shapes, and for a non-finite motion of a tool.
+    Raise ValueError if shapes differ, or if the motion of a tool is not finite.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
     if "energy" in outcome:
@@ -259,7 +268,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return arrays whose names contain slashes as nested dictionaries."""
+    """Return arrays with slashes in their names as nested dictionaries."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -271,9 +280,10 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64], total: int) -> MaterialPoints:
-    """Return points with these ids from stored arrays; ValueError if they do not match `like`.
+    """Return the material points with the given ids from the stored arrays.
 
-    Renewed points replace some seeded points; their ids are at least `total`, the number of seeded points.
+    Raise ValueError if names, shapes or ids do not match `like`.  Renewed points replace some seeded points;
+    their ids are at least `total`, the number of seeded points.
     """
     data = _part(arrays, "data/")
     if PARENT in data:
@@ -286,18 +296,18 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
         if rows.dtype != kind.dtype or rows.shape != (len(ids), *kind.shape[1:]) or not np.isfinite(rows).all():
             raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
     if set(data) != set(like.data) or not np.array_equal(points.id, ids):
-        raise ValueError("points/id: points differ from those of the bodies")
+        raise ValueError("points/id: points differ from the points of the bodies")
     return points
 
 
 def _nodes(grid: Grid) -> NDArray[np.int64]:
-    """Return the lexicographic numbers of this process's nodes."""
+    """Return the lexicographic numbers of the nodes of this process."""
     *index, copy = grid.node_places(np.arange(len(grid.node_x))).T
     return np.ravel_multi_index(tuple(index), tuple(grid.shape + 1)) + copy * grid.nodes
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return numbers and values of the nodes with non-zero values, of all processes, on rank 0; empty for None."""
+    """Return, on rank 0, numbers and values of all nodes with non-zero values; an empty dictionary for None."""
     if nodal is None:
         return {}
     nodal = nodal.reshape(-1, grid.dim)
@@ -309,21 +319,21 @@ def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> d
 
 
 def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.float64] | None:
-    """Return this process's nodal values from the stored nodes with non-zero values; None for None."""
+    """Return the nodal values on this process, from the stored nodes with non-zero values; None if `given` is None."""
     if given is None:
         return None
     node, values = given["node"], np.concatenate([given["values"], np.zeros((1, grid.dim))])
-    here = _nodes(grid)
-    at = np.searchsorted(node, here)
-    found = np.append(node, -1)[at] == here
+    own_nodes = _nodes(grid)
+    at = np.searchsorted(node, own_nodes)
+    found = np.append(node, -1)[at] == own_nodes
     return values[np.where(found, at, len(node))].ravel()
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError for arrays that are not lines of the grid, which follows."""
+    """Raise ValueError for arrays that are not lines of this grid, whose lines must follow a tool or function."""
     shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
     if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
-        raise ValueError("lines: not those of the grid")
+        raise ValueError("lines: not the lines of the grid")
     for letter, low, high in zip(shapes, grid.low, grid.high, strict=True):
         x = arrays[letter]
         if x.dtype != np.float64 or not (np.diff(x) > 0).all() or x[0] != low or x[-1] != high:
@@ -331,7 +341,7 @@ def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
 
 
 def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError for arrays that are not nodal values on the grid."""
+    """Raise ValueError for arrays that are no nodal values on the grid."""
     node, values = arrays.pop("node"), arrays.pop("values")
     right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
     if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
@@ -341,29 +351,40 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
     arrays |= {"node": node, "values": values}
 
 
+def _check_trend(trend: Trend, points: MaterialPoints) -> None:
+    """Raise ValueError for a trend that does not belong to the points."""
+    (n, d), k = points.x.shape, len(trend.lengths)
+    right = k in (1, 2) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d, 1 + d)
+    if not right or not all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values()):
+        raise ValueError("trend: does not fit the points, or is not finite")
+    if not (trend.lengths > 0).all():
+        raise ValueError("trend: lengths: steps must be > 0")
+
+
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
-    """Raise ValueError for arrays that do not belong to pieces of points with these ids."""
+    """Raise ValueError for arrays that do not describe pieces of the points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
         if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
             raise ValueError(f"pieces: {name}: {rows.dtype} of shape {rows.shape}, or not finite")
     if not np.array_equal(np.unique(arrays["id"]), ids) or (np.diff(arrays["id"]) < 0).any():
-        raise ValueError("pieces: id: points differ from those of the bodies")
+        raise ValueError("pieces: id: points differ from the points of the bodies")
 
 
 def _without_rows(state: State) -> State:
-    """Return a state without points and pieces."""
+    """Return a state without its points and pieces."""
     none = np.empty(0, np.int64)
     points = state.points.of(none)
     stay = state.stay
     if stay is not None:
         stay = Stay(stay.points.of(none), None if stay.keeps is None else stay.keeps[:0])
-    return replace(state, points=points, pieces=state.pieces and state.pieces.of(none), stay=stay)
+    trend = state.trend and replace(state.trend, rates=state.trend.rates[:0])
+    return replace(state, points=points, pieces=state.pieces and state.pieces.of(none), stay=stay, trend=trend)
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return the arrays of nested dictionaries by names with slashes."""
+    """Return the arrays in nested dictionaries, with slashes in their names."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -371,12 +392,12 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
 
 
 def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    """Remove the arrays whose names begin with a prefix, and return them without it."""
+    """Remove the arrays whose names begin with a prefix; return these, without the prefix in their names."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Return the arrays of a checkpoint and its note."""
+    """Return the arrays and the metadata of a checkpoint file."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
@@ -400,14 +421,14 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 
 def describe(simulation: Simulation) -> dict[str, Any]:
-    """Return the constants that define the scene, by name, as a checkpoint stores them."""
+    """Return the constants that identify the scene in a checkpoint, by name."""
     kept = sorted(simulation.state.stage.kept(0))
     more = {"bodies present": list(simulation.present), "data that points keep of conditions": kept}
     return {**simulation.scene.description, **more}
 
 
 def _check_scene(file: Path, stored: dict[str, Any], present: dict[str, Any]) -> None:
-    """Raise ValueError for the checkpoint of another scene."""
+    """Raise ValueError if the checkpoint belongs to another scene."""
     for name in {**stored, **present}:
         if stored.get(name) != present.get(name):
             both = f"{stored.get(name)} there, {present.get(name)} here, must agree"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""All output times of the material points of a run in one XDMF file for ParaView, with its data in HDF5."""
+"""Material points at all output times of a run, in one XDMF file for ParaView with data in HDF5."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from mpm_dolfinx.io.writer import Series
 
 
 def one_file(folder: str | os.PathLike) -> Path:
-    """Write the points that a `Writer` has written to a folder as one time series: `points.xdmf` and `points.h5`.
+    """Write the points in the folder of a `Writer` as one time series: `points.xdmf` and `points.h5`.
 
-    ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read it. dolfinx reads the particle domains of one output time as
-    a mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third. Each output time has its own
-    domains, so bodies may be excavated and placed in between. `<Information>` in points.xdmf describes the fields and
-    their units. The files of the `Writer` are kept. During a run it writes the output times so far; call it again at
-    the end.
+    ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read these files.  dolfinx reads the particle domains of one
+    output time as a mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third.  Each output time
+    has separate domains, so bodies may be excavated and placed in between.  `<Information>` in points.xdmf describes
+    the fields and their units.  The files of the `Writer` are kept.  A call during a run writes the output times so
+    far; call the function again at the end.
 
     Parameters
     ----------
     folder
-        Folder of the `Writer`. The two files appear in it when they are complete.
+        Folder of the `Writer`.  Both files appear in this folder when they are complete.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def one_file(folder: str | os.PathLike) -> Path:
     Raises
     ------
     ValueError
-        The folder has no points of a `Writer`, or no h5py that is compatible with dolfinx is installed.
+        The folder contains no points of a `Writer`, or no h5py that is compatible with dolfinx is installed.
     OSError
         The folder is not writable, or the disk is full.
     """
@@ -50,7 +50,7 @@ def one_file(folder: str | os.PathLike) -> Path:
         raise ValueError(f"one_file: folder = {folder}: has no points.pvd, must be the folder of a Writer")
     try:
         import h5py
-    except Exception as error:  # PyPI's h5py has its own HDF5, which conflicts with dolfinx's in many ways
+    except Exception as error:  # PyPI's h5py brings a second HDF5, which conflicts with dolfinx's in many ways
         which = "Debian's (apt install python3-h5py) or, with conda's dolfinx, conda-forge's"
         raise ValueError(f"one_file: h5py: {line_of(error)}; must be {which}") from error
     entries = Series(MPI.COMM_SELF, folder / "points.pvd", np.inf).entries
@@ -69,7 +69,7 @@ def one_file(folder: str | os.PathLike) -> Path:
 
 
 def _add(writer: TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
-    """Add a mesh and its fields; meshio's `write_data` supports only one mesh for all times."""
+    """Add a mesh and its fields.  meshio's `write_data` allows only one mesh for all times."""
     grid = SubElement(writer.collection, "Grid", Name=str(number), GridType="Uniform")
     SubElement(grid, "Time", Value=repr(t))
     writer.points(grid, mesh.points)

@@ -17,22 +17,22 @@ from mpm_dolfinx.simulation.simulation import Simulation
 
 
 def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
-    """Draw the particle domains, coloured by a field, and return the axes of matplotlib.
+    """Draw the particle domains, coloured by a field; return the axes of matplotlib.
 
-    The call is collective: the first process draws, the others return None.
+    All processes must call this function.  The first process draws, the others return None.
 
     Parameters
     ----------
     simulation
-        The scene, in plane strain or axisymmetry.
+        A scene in plane strain or axisymmetry.
     field
         "pressure", "displacement" (its magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
         "mean_effective_stress", "deviatoric_stress", "porosity", "J", and any other scalar in `points.pvd` and
         `points.data`.
     ax
-        Axes to draw into; by default new ones.
+        Axes for the picture; by default new axes.
     bar
-        Draw a colour bar with the unit.
+        Whether to draw a colour bar with the unit.
     label
         Label of the colour bar; by default the name of the field and its unit.
     **style
@@ -41,7 +41,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     Raises
     ------
     ValueError
-        A scene in 3D, or an unknown field; the message lists the fields of the points.
+        The scene is in 3D, or the field is unknown; the message lists the fields of the points.
     ImportError
         matplotlib is not installed.
     """
@@ -69,7 +69,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     if bar:
         known = unit(field)
         label = label or field.replace("_", " ") + (f" ({known})" if known else "")
-        cax = ax.inset_axes(bounds=(1.03, 0, 0.04, 1))  # as high as the body, which may be flat
+        cax = ax.inset_axes(bounds=(1.03, 0, 0.04, 1))  # as high as the axes, which may be flat
         ax.figure.colorbar(drawn, cax=cax).ax.set_title(label, loc="right", fontsize="medium")
     return ax
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contents and units of the output files, as a text for the output folder."""
+"""Names, units and meaning of the fields in the output files, as a text for the output folder."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ FIELDS = {
         "displacement": "m, since the start, or since the last reset by a stage",
         "F, J": "-, deformation gradient, by components F_xy in plane strain; its determinant, the volume ratio",
         "pressure": "Pa, pore pressure, positive in compression",
-        "effective_stress": "Pa, Cauchy stress of the skeleton, tension positive; zz: out of plane, or hoop",
+        "effective_stress": "Pa, Cauchy stress of the skeleton, tension positive; zz: out of plane, or circumferential",
         "stress": "Pa, Cauchy stress of skeleton and fluid together",
         "mean_effective_stress": "Pa, p' = -(xx + yy + zz) / 3, positive in compression",
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
         "porosity": "-, current volume fraction of the pores",
         "saturation": "-, volume fraction of water in the pores, of unsaturated soil",
-        "owed, due": "-, volume defect over reference volume; its part that the next step corrects",
-        "softness": "-, elastic over tangent shear modulus where a law yields, 1 to 100",
+        "owed, due": "-, volume defect / reference volume; the part of it that the next step corrects",
+        "softness": "-, elastic shear modulus / tangent shear modulus, where a law yields, 1 to 100",
         "tool_pressure, tool_shear": "Pa, contact pressure and shear of the tool `tool` on the surface of the domain",
         "others": "state of the law (see its documentation), constants that vary in space, data of the user",
     },
@@ -30,10 +30,10 @@ FIELDS = {
         "step_displacement": "m, nodal displacement increment of the last step",
     },
     "history.csv: one row for each output time": {
-        "t, wall": "s, time of the scene; wall time so far",
-        "steps, newton, coupling, cuts, rederived": "steps, Newton and coupling iterations, cut steps, domains mended",
+        "t, wall": "s, time in the scene; wall time so far",
+        "steps, newton, coupling, cuts, rederived": "steps, Newton, coupling iterations, shortened steps, new domains",
         "balance, residual": "-, largest relative error so far of the fluid balance, and of the two problems",
-        "p_min, p_max": "Pa, least and largest pore pressure of the material points",
+        "p_min, p_max": "Pa, smallest and largest pore pressure of the material points",
         "x_0, y_0, z_0": "m, current position of probe 0; likewise for the other probes",
         "ux_0, uy_0, uz_0": "m, displacement of probe 0",
         "p_0": "Pa, pore pressure at probe 0",
@@ -50,7 +50,7 @@ FIELDS = {
         "outflow_NAME": "m^3/s, in plane strain m^2/s, outflow through the open side NAME",
     },
 }
-"""Names, units and meaning of all written fields, by file."""
+"""Unit and meaning of each written field, by file and name."""
 
 
 def text() -> str:
@@ -63,7 +63,7 @@ def text() -> str:
 
 
 def unit(name: str) -> str:
-    """Return the unit of a field of points, or of one of its components; an empty string if it is unknown."""
+    """Return the unit of a field of points, or of a component of the field; an empty string if unknown."""
     for names, meaning in FIELDS["points.pvd: the domains of the material points"].items():
         for each in names.split(", "):
             if each not in ("id", "material", "others") and (name == each or name.startswith(f"{each}_")):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Files of a run: material points and grid for ParaView, histories as a table.
 
-Every output is a separate file. A new index of these files replaces the old one only when it is complete. All output
-written before the end of a run can therefore be read, however the run ends.
+Every output is a separate file.  A new index of these files replaces the old index only when it is complete.  All
+output written before the end of a run can therefore be read, however the run ends.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tables import columns, components
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
-from mpm_dolfinx.contact.tool import Tool, gone
+from mpm_dolfinx.contact.tool import Tool, motion_by_forces
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
@@ -37,50 +37,50 @@ from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-"""VTK's cell type of a particle domain, and the domain's corners in VTK's order."""
+"""VTK's cell type of a particle domain, and the order of the domain's corners in VTK."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
 COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
 
 
 class Writer:
-    """Writes points, histories and grid of a run: an observer of `Simulation.run`.
+    """Writes points, histories and grid of a run, as an observer of `Simulation.run`.
 
     The folder receives
 
-    * `points.pvd`: the particle domains as solid cells. Their fields are displacement, pore pressure, F, J, all data of
-      the points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
-    * `history.csv`: one row for each output time, with counts of `Result`, least and largest pressure, records of
-      probes, forces of prescribed displacements and tools, and outflows. The last two are nan until a stage's first
-      step;
+    * `points.pvd`: the particle domains as solid cells.  Fields are displacement, pore pressure, F, J, all data of the
+      points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
+    * `history.csv`: one row for each output time, with counts of `Result`, smallest and largest pressure, quantities at
+      probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan before the first
+      step of a stage;
     * `fields.txt`: meaning and unit of each of these fields;
-    * with tools, `tools.pvd`: the parts of the grid's cells inside the tools, with the forces of the tools;
-    * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`), by components, zero in empty cells.
+    * with tools, `tools.pvd`: the parts of the grid cells inside the tools, with the forces of the tools;
+    * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`) by components, zero in empty cells.
 
-    ParaView and VTK read all files, meshio reads the points.
+    ParaView and VTK read all files; meshio reads the points.
 
-    Output up to the present time stays in the folder and is continued. A writer made after `resume` therefore leaves
-    the same files as a run without interruption.
+    The new run continues the output up to the current time that is already in the folder.  A writer created after
+    `resume` therefore leaves the same files as a run without interruption.
 
     A writer locks its folder against other processes until `close`, the end of its context, or its deletion.
 
     Parameters
     ----------
     simulation
-        The scene, in the state from which the run starts.
+        The scene, in the state from which the run will start.
     folder
         Folder of the files.
     every
-        Output intervals between two files of points and grid, >= 1; start and end are always written.
+        Number of output intervals between two files of points and grid, >= 1.  Start and end are always written.
     grid
-        Write the fields of the grid too.
+        Whether to write the fields of the grid cells too.
 
     Raises
     ------
     ValueError
-        An argument of the wrong type; files in the folder that no writer has written, or with other columns; a run of
-        another simulation, or one that starts at another time; a closed writer.
+        An argument of the wrong type.  Files in the folder that no writer has written, or with other columns.  A run of
+        another simulation, or one that starts at another time.  A closed writer.
     OSError
-        The folder is not writable, or the disk is full. `simulation.run(..., after=simulation.result)` continues.
+        The folder is not writable, or the disk is full.  `simulation.run(..., after=simulation.result)` continues.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
@@ -91,7 +91,7 @@ class Writer:
         self._t = simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
         self.closed = False
-        """Whether the writer has released its folder."""
+        """Whether the writer has released the lock of its folder."""
         tools = simulation.state.stage.of(Tool)
         own = tuple(f"{quantity.removesuffix('s')}_" for quantity in simulation.state.outcome)
         with on_disk("writer: folder", "writable"):
@@ -112,18 +112,18 @@ class Writer:
         self.close()
 
     def close(self) -> None:
-        """Release the folder to other processes. All files are complete. A second call does nothing."""
+        """Release the lock of the folder.  All files are complete.  A second call has no effect."""
         self._lock, self.closed = None, True
 
     def _hold(self, folder: Path) -> None:
         self._lock = Lock.of(folder)
 
     def __call__(self, simulation: Simulation) -> None:
-        """Write a row of the histories and, every `every` intervals, the present state."""
+        """Write a row of the histories and, every `every` output intervals, the current state."""
         if self.closed:
             raise ValueError(f"writer: {self._points.file.parent} is closed, must be open while the run goes on")
         if simulation is not self._simulation:
-            raise ValueError("writer: made for another simulation, must be made for the one that runs")
+            raise ValueError("writer: made for another simulation, must be made for the simulation that runs")
         with on_disk(f"{self._points.file.parent}: writer at t = {simulation.t:g} s", WRITABLE):
             self._write(simulation)
 
@@ -140,9 +140,10 @@ class Writer:
         self._write_indices()
 
     def _start(self, result: Result) -> None:
-        """Drop the output of later times from the folder: a new run continues it from here."""
+        """Remove the output of later times from the index and the table, because a new run continues from here."""
         if (start := result.rows[-2][0]) != self._t:
-            raise ValueError(f"writer: made at t = {self._t:g} s for a run that starts at t = {start:g} s")
+            what = f"writer: made at t = {self._t:g} s, but the run starts at t = {start:g} s"
+            raise ValueError(f"{what}; must be made just before the run")
         self._table.start(_row(Result(result.rows[-2:-1])))
         self._write_indices()
 
@@ -172,7 +173,7 @@ class Writer:
         comm, stem = simulation.grid.comm, self._grid.next
         with _true_places(simulation.grid):
             _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
-        if comm.rank == 0:  # our index names the files of the processes; dolfinx 0.5 repeats them for each function
+        if comm.rank == 0:  # the index of this writer lists the files of all processes; dolfinx 0.5 repeats them
             stem.with_suffix(".pvd").unlink(missing_ok=True)
             stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
         pieces = [stem.with_name(f"{stem.name}_p{rank}_000000.vtu") for rank in range(comm.size)]
@@ -182,7 +183,7 @@ class Writer:
 
 
 def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
-    """Return porosity, saturation, components and invariants of stresses (n,) at this process, by name."""
+    """Return porosity, saturation, components and invariants of stresses (n,) of this process's points, by name."""
     fields, wet = simulation.point_fields(), simulation.scene.fluid is not None
     drains = simulation.scene.materials.retentions is not None
     out = {name: getattr(fields, name) for name in ("porosity", "saturation")[: 1 + drains]}
@@ -193,9 +194,11 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write the parts of the grid's cells inside the tools, with number and force of each tool."""
+    """Write the parts of the grid cells inside the tools, with number and force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
-    corners = [tool.drawn(grid, simulation.t, gone(simulation.state.outcome, name)) for name, tool in tools.items()]
+    corners = [
+        tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
+    ]
     forces = np.stack([simulation.tool_forces[name][: grid.dim] for name in tools])
     number = np.repeat(np.arange(len(tools)), [len(one) for one in corners])
     with replacing(file) as part:
@@ -203,7 +206,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """An exclusive lock of a folder; it ends with the last writer of this process that holds it."""
+    """An exclusive lock of a folder.  It ends when the last writer of this process releases it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
@@ -213,12 +216,12 @@ class Lock:
         try:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as error:
-            what = f"writer: folder = {folder}: another run writes into it, must be one of its own"
+            what = f"writer: folder = {folder}: another run writes into it, must be a separate folder"
             raise ValueError(what) from error
 
     @classmethod
     def of(cls, folder: Path) -> Lock:
-        """Return the lock of a folder, which is created if necessary; ValueError if another process holds it."""
+        """Return the lock of a folder, which is created if necessary; raise ValueError if another process holds it."""
         folder.mkdir(parents=True, exist_ok=True)
         folder = folder.resolve()
         lock = cls._held.get(folder)
@@ -228,23 +231,23 @@ class Lock:
 
 
 def _row(result: Result) -> dict[str, float]:
-    """Return the histories at the last output time, and the outcomes of the conditions at that time."""
+    """Return the histories and the results of the conditions at the last output time."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
     return out | {name: float(value) for name, (value, _) in columns(row, row.outcome).items()}
 
 
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
-    """Return the particle domains as unconnected cells, with all fields of the points.
+    """Return the particle domains as unconnected cells, with all fields of the material points.
 
     Parameters
     ----------
     points
         All material points.
     displacement : (n, d), m
-        Their displacements.
+        Displacements of the points.
     wet
-        Whether the pore pressure of the points is defined.
+        Whether the points have a pore pressure.
     """
     fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
     if wet:
@@ -266,8 +269,8 @@ def _padded(vectors: NDArray) -> NDArray:
 
 
 def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
-    """Yield the fields by which VTK shows scalars, vectors or tensors (n, ...)."""
-    if rows.shape[1:] == (2, 2):  # not as 3 x 3: the out-of-plane components are unknown
+    """Yield the names and values of the fields in which VTK displays scalars, vectors or tensors (n, ...)."""
+    if rows.shape[1:] == (2, 2):  # not padded to 3 x 3, because the out-of-plane components are unknown
         for i, j in np.ndindex(2, 2):
             yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
     elif rows.shape[1:] == (2,):
@@ -277,7 +280,7 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
-    """Return the displacement increment of the step and the fields of the cells as functions, named as in the file."""
+    """Return the displacement increment of the step and the fields of the cells as functions with names."""
     scene, d = simulation.scene, simulation.grid.dim
     cells, u = simulation.cells(), scene.momentum.u
     moved = fem.Function(u.function_space, name="step_displacement")
@@ -301,7 +304,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 
 @contextmanager
 def _true_places(grid: Grid) -> Iterator[None]:
-    """Shift the mesh of a grid to the true positions of its nodes while it is written."""
+    """Shift the mesh of a grid to the true positions of its nodes, within this context."""
     x = grid.mesh.geometry.x
     own = x.copy()
     x[:, : grid.dim] += grid.base
@@ -327,7 +330,7 @@ def _ends(file: Path) -> bool:
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """Give a temporary path for writing; the complete file then replaces `file`, once it is on the disk."""
+    """Provide a temporary path for writing.  The complete file then replaces `file`, once it is on the disk."""
     part = file.with_name(file.name + ".part")
     yield part
     with open(part, "rb") as f:
@@ -337,23 +340,24 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Raise ValueError for a file that no `Writer` has written."""
+    """Raise ValueError for a file that no `Writer` has written, within this context."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or take another folder") from error
+        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or use another folder") from error
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
-    """Return the earlier entries (time, ...) that a run from time t keeps: none if it is a new run."""
+    """Return the earlier entries (time, ...) that a run from time t continues; none if it is a new run."""
     out = [entry for entry in entries if entry[0] <= t]
     return out if any(entry[0] < t for entry in out) else []
 
 
 class Series:
-    """A time series for ParaView: an index (.pvd) and its files, in a folder of the same name.
+    """A time series for ParaView: an index (.pvd), and files in a folder with the same name.
 
-    entries: (time, its files) so far, the same on every process; next: path of the next file, without suffix.
+    `entries` are the times so far with their files, the same on every process.  `next` is the path of the next file,
+    without suffix.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
@@ -376,7 +380,7 @@ class Series:
         return list(times.items())
 
     def write_index(self) -> None:
-        """Write the index of all files so far."""
+        """Write the index of all files that exist so far."""
         root = ElementTree.Element("VTKFile", type="Collection", version="1.0")
         collection = ElementTree.SubElement(root, "Collection")
         for t, files in self.entries:
@@ -392,9 +396,9 @@ class Series:
 
 
 class Table:
-    """A table in a CSV file, to which rows are added one by one; the first column is the time.
+    """A table in a CSV file, to which rows are added.  The first column is the time.
 
-    Columns whose names begin with one of `own` belong to conditions: they may change from stage to stage.
+    Columns whose names begin with one of `own` belong to conditions, and may change from stage to stage.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
@@ -403,7 +407,7 @@ class Table:
         self._own = own
         self._rows = at_root(comm, lambda: kept(self._read(), t))
         self.columns: list[str] = []
-        """Names of the columns, after `start`."""
+        """Names of the columns, known after `start`."""
 
     def _read(self) -> list[tuple[float, dict[str, str]]]:
         if not self.file.exists():
@@ -414,7 +418,7 @@ class Table:
             return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
-        """Write the kept rows, or a first row if there are none."""
+        """Write the rows of earlier times, or a first row if there are none."""
         rows = [row for _, row in self._rows] or [first]
         self.columns = list(rows[0])
         self._check(first)
@@ -426,7 +430,7 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row. New columns rewrite the file, with nan in all earlier rows."""
+        """Add a row.  If it has new columns, the file is written again, with nan in these columns of earlier rows."""
         self._check(row)
         new = [name for name in row if name not in self.columns]
         self.columns.extend(new)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Constitutive laws, and their evaluation at points and pieces."""
+"""Constitutive laws, and their evaluation at material points and pieces of particle domains."""

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: MIT
 """Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
-Plasticity is multiplicative, in principal logarithmic strains.  With the elastic volume strain e_v and deviator e
-(tension positive), P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau| in Kirchhoff stress,
+Plasticity is multiplicative, in principal logarithmic strains.  With the Kirchhoff stress tau, the
+elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|,
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
-and flow is associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  A step is implicit, from trial
-stresses P_t and Q_t, w = (Q_t / (M P_t))^2, with the plastic compaction kappa a and 6G dgamma / M^2 = exp(h) - 1:
+and flow is associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  The stress at the end of a
+step follows implicitly from the trial stresses P_t and Q_t.  With w = (Q_t / (M P_t))^2, plastic compaction kappa a and
+the plastic multiplier dgamma from 6G dgamma / M^2 = exp(h) - 1:
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a), the change of the stress ratio: Q / (M P) = sqrt(w) exp(-d/2).  The yield surface
-yields a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at the
-critical state, where a is zero, and at isotropic stresses.
+The local unknown is d = 2 (h - a), the change of the stress ratio: Q / (M P) = sqrt(w) exp(-d/2).  On the yield surface
+a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at isotropic
+stresses and at the critical state (a = 0).
 
-If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Its stress then jumps, or the
-step has no solution and is cut.
+If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the
+equation has no solution and the time step is reduced.
 """
 
 from __future__ import annotations
@@ -47,14 +48,14 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A constant that follows from other constants."""
+    """A constant derived from other constants."""
 
     follows = True
 
 
 @dataclass(frozen=True)
 class _FollowsByPlace:
-    """A bulk modulus P_0 / kappa as a function of position; initial stress and kappa are values or functions."""
+    """The bulk modulus P_0 / kappa as a function of position; initial stress and kappa are values or functions."""
 
     stress: object
     kappa: object
@@ -75,17 +76,17 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes lambda* and kappa* of ln v over ln P in first loading and unloading, -, 0 < kappa < lambda_, in Kirchhoff
-        stress.  A compression index C of v over the logarithm of the Cauchy stress corresponds to C / (v - C).
+        Slopes lambda* and kappa* of ln v against ln P in first loading and unloading, -, 0 < kappa < lambda_.  P is a
+        Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C / (v - C).
     initial_stress : (3,), Pa
-        Normal effective stresses at F = I, the last one out of plane in 2D, circumferential in axisymmetry; tension
-        positive, mean < 0.  They must be in equilibrium with the loads.
+        Normal effective stresses at F = I, tension positive, mean < 0.  The last one is out of plane in 2D, and
+        circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: initial size of the yield surface / size through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial size of the yield surface / size at which it contains the stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
-        Must be left out: it is P_0 / kappa at the start.
+        Must not be given: the bulk modulus at the start is P_0 / kappa.
 
     Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `consolidated`,
     ln(P_c / initial P_c), in `points.data`.  Source: Borja and Tamagnini (1998).
@@ -93,7 +94,7 @@ class ModifiedCamClay(Skeleton):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     bulk: Field = None
@@ -119,7 +120,7 @@ class ModifiedCamClay(Skeleton):
         super().__post_init__()
 
     def _set_bulk(self) -> None:
-        """Set the initial bulk modulus, which scales the scheme."""
+        """Set the initial bulk modulus, which scales the coupling scheme."""
         stress, kappa = self.initial_stress, self.kappa
         if callable(stress) or callable(kappa):
             bulk = _FollowsByPlace(stress, kappa)
@@ -157,14 +158,14 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def trial(F, prestretch, plastic):
-        """Return volume strain and squared deviatoric strain, e_s^2 = 2/3 e : e, of the trial strain."""
+        """Return the volume strain e_v and the squared deviatoric strain, e_s^2 = 2/3 e : e, of the trial strain."""
         strain = Trial(F, plastic, prestretch)
         e = strain.deviatoric
         return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
 
     @staticmethod
     def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the residual for d: the flow rule on the yield surface."""
+        """Return the residual of the equation for d: the flow rule on the yield surface."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
@@ -202,7 +203,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a function of Modified Cam Clay under suction, with lambda(s) and P_c(s)."""
+    """Return a function of Modified Cam Clay evaluated with lambda(s) and P_c(s) at the suction s."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -218,7 +219,7 @@ def _dried(function: Callable) -> Callable:
         initial = ufl.conditional(ufl.gt(start, 0), start / power(given["suction_at_start"]), start)
         size = initial + consolidated  # ln(P_c0 / P_r)
         s = ufl.conditional(ufl.gt(size, 0), given["trial"]["suction"], 0.0)
-        dried = consolidated + (power(s) - 1) * size + (initial - start)  # ln of P_c over that at the start
+        dried = consolidated + (power(s) - 1) * size + (initial - start)  # ln(P_c / initial P_c)
         out = function(**({name: given[name] for name in arguments} | {"lambda_": slope(s), "consolidated": dried}))
         if function is ModifiedCamClay.update:
             out["consolidated"] = consolidated + (out["consolidated"] - dried) / power(s)
@@ -233,39 +234,39 @@ def _dried(function: Callable) -> Callable:
 class BarcelonaBasic(ModifiedCamClay):
     """Modified Cam Clay with a yield surface that grows with suction, for soil that collapses on wetting.
 
-    At a suction s = max(-p, 0) the yield surface in Bishop's stress has the size
+    At a suction s = max(-p, 0) the yield surface in Bishop's stress has the size P_c:
 
         P_c / P_r = (P_c0 / P_r)^((lambda(0) - kappa) / (lambda(s) - kappa)),
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
-    the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  Soil at constant
-    suction is Modified Cam Clay with lambda(s), saturated soil with lambda(0).  Bishop's stress alone determines the
-    strength due to suction and the swelling on wetting.  The suction is evaluated at the end of a substep.  It has no
-    effect once P_c0 has fallen to P_r.
+    This is the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  At constant
+    suction the law is Modified Cam Clay with lambda(s); for saturated soil, with lambda(0).  Bishop's stress alone
+    determines the strength due to suction and the swelling on wetting.  The suction is evaluated at the end of a
+    substep.  Suction has no effect once P_c0 is below P_r.
 
     Parameters
     ----------
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: P_c at the initial suction / size of the surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial P_c / size at which the yield surface contains the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r
-        lambda of very dry soil / lambda(0), -, > kappa / lambda_, <= 1.
+        Ratio of lambda of very dry soil to lambda(0), -, > kappa / lambda_, <= 1.
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, at which suction has no effect; usually 0.01 to 0.5 times P_c0.
+        Stress P_r, Pa, > 0, below which P_c0 is independent of suction; usually 0.01 to 0.5 times the initial P_c0.
 
-    Other parameters: see `ModifiedCamClay`.  In a scene with fluid `retention` must be given.  The state is that of
-    Modified Cam Clay, with `consolidated` for P_c0, and `suction`, Pa.  Source: Alonso, Gens and Josa (1990); in
-    Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  The state is that of Modified
+    Cam Clay, with ln(P_c0 / initial P_c0) as `consolidated`, and `suction`, Pa.  Source: Alonso, Gens and Josa (1990);
+    in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     r: Field = None
@@ -299,10 +300,10 @@ class BarcelonaBasic(ModifiedCamClay):
 
 
 class _Return:
-    """Return to the yield surface for a given d.
+    """Return to the yield surface for a given d, see the module's docstring.
 
-    compaction, flow: a and h; steepness: w exp(-d), squared Q / (M P) at the end; trial_pressure: P_t, Pa; rho: (change
-    of ln P_c) / a; yields: whether the trial stress is outside.
+    compaction, flow: a and h; steepness: w exp(-d), the squared Q / (M P) at the end; trial_pressure: P_t, Pa.
+    rho: ln(P_c / P_c,n) / a; yields: whether the trial stress is outside the yield surface.
     """
 
     def __init__(self, trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):

@@ -7,7 +7,7 @@ The return to the yield surface
 
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
-has the closed form of small strain, to the cone or to its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).
+has the closed form of small strain, on the cone or at its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).
 The consistent tangent is UFL's derivative of the stress.
 """
 
@@ -30,11 +30,11 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Match of the cone to Mohr and Coulomb's pyramid: (eta, xi) as functions of tan phi, sin phi and cos phi."""
+"""Parameters (eta, xi) of the cone as functions of tan phi, sin phi and cos phi, for each match to Mohr and Coulomb."""
 LEAST = 1e-20
-"""Constant under the root of the squared deviatoric strain, which keeps its derivative finite.
+"""Constant added to the squared deviatoric strain under the square root, so that its derivative is finite at zero.
 
-Plateau (soil): halved 2.3e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.3e-11, twice by 1.0e-11, finer cells by 3.0e-02.
 """
 
 
@@ -47,17 +47,17 @@ class DruckerPrager(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90).
     dilation
-        Dilation angle psi, degrees, in [0, friction].  At the friction angle flow is associated, and the tangent is
-        symmetric.
+        Dilation angle psi, degrees, in [0, friction].  If it equals the friction angle, flow is associated and the
+        tangent is symmetric.
     cohesion
-        Cohesion c_0, Pa, >= 0.  With zero, points without pressure have no stiffness.
+        Cohesion c_0, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     hardening
-        Linear hardening H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa (work conjugate to c
-        in associated flow).
+        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa.  kappa is the accumulated plastic strain (work
+        conjugate to c in associated flow).
     match
-        The cone meets Mohr and Coulomb's surface in "plane strain" (equal collapse load, exact for associated flow),
-        triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  No cone matches everywhere in
-        axisymmetry: a circular footing on von Mises's soil carries a tenth less than on Tresca's.
+        Stress states in which the cone agrees with Mohr and Coulomb's surface: "plane strain" (equal collapse load,
+        exact for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In
+        axisymmetry no cone agrees everywhere: a circular footing on von Mises's soil bears 10 % less than on Tresca's.
 
     Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `hardened`, kappa, in
     `points.data`.  Source: de Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
@@ -65,7 +65,7 @@ class DruckerPrager(Frictional):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     hardening: Field = 0.0
@@ -86,17 +86,17 @@ class DruckerPrager(Frictional):
 
     @property
     def eta(self):
-        """Slope of the cone."""
+        """Coefficient eta of the pressure in the yield function."""
         return self._cone(self.friction)[0]
 
     @property
     def xi(self):
-        """Factor of the cohesion."""
+        """Coefficient xi of the cohesion in the yield function."""
         return self._cone(self.friction)[1]
 
     @property
     def eta_flow(self):
-        """Slope of the plastic potential."""
+        """Coefficient of the pressure in the plastic potential."""
         return self._cone(self.dilation)[0]
 
     @staticmethod
@@ -129,12 +129,12 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the trial stress to the yield surface; drag: viscosity / time, Pa.
+    """Return the stress and the hardening after the return to the yield surface; drag: viscosity / time, Pa.
 
     Returns
     -------
-    p: pressure, Pa; ratio: deviator / trial deviator; yields: whether the trial stress is outside; apex: 1 for a return
-    to the apex, else 0; hardened: growth of the hardening variable.
+    p: pressure, Pa; ratio: deviatoric stress / its trial value; yields: whether the trial stress is outside the yield
+    surface; apex: 1 for a return to the apex, else 0; hardened: increment of the hardening variable.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)
@@ -142,7 +142,7 @@ def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, 
     f = q + eta * p - strength
     cone = f / (shear + bulk * eta * eta_flow + xi**2 * hardening + drag)
     to_cone = ufl.le(shear * cone, q)
-    slope = xi / (eta + EPSILON)  # without friction there is no apex, but every branch must be finite
+    slope = xi / (eta + EPSILON)  # without friction the cone has no apex, but every branch must be finite
     apex = (p - strength / (eta + EPSILON)) / (bulk + slope**2 * hardening)
     yields = ufl.gt(f, 0)
 

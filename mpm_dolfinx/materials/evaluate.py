@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Evaluation of laws: stresses and new state at the material points, conductivities at the pieces."""
+"""Evaluation of laws: stresses and new state at the material points, conductivities in pieces of particle domains."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class LawAtPoints:
     law
         Class of the law.
     shapes
-        Shape of each of its parameters and of its variables of state.
+        Shape of each parameter and state variable of the law.
     stretches
-        Number of axes of its deformation gradients; by default that of the grid.
+        Size of the law's deformation gradients, 2 or 3; by default that of the grid.
     cell_size
-        Cell size for laws, m; by default the mean cell size of the grid.
+        Cell size passed to the law, m; by default the mean cell size of the grid.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class LawAtPoints:
 
     @cached_property
     def points(self) -> FormPoints:
-        """Points with F, and with the parameters and state of the law."""
+        """Integration points with F, and with the parameters and state of the law."""
         return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
 
     @cached_property
@@ -86,7 +86,7 @@ class LawAtPoints:
         return {**self._given, **own}
 
     def _solve(self, data: PointData, dt: float) -> None:
-        """Set the time since the start of the step, s, and solve for local unknowns."""
+        """Set the time since the start of the step, s, and solve for the local unknowns."""
         self._by_scene["dt"].value = dt
         if self._local is not None:
             self._local.update(data, derive=False)
@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return some of the material points, with values (n, ...) of F, parameters and state."""
+        """Return the form data of material points `rows`; values (n, ...): F, parameters and state of all points."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -107,7 +107,7 @@ class LawAtPoints:
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, in the shape of F; dt: time since the state, s."""
+        """Return the effective Cauchy stress (n, d, d), Pa; dt: time since the last update of the state, s."""
         stress = self._stress
         self._solve(data, dt)
         return stress.evaluate(data)
@@ -138,7 +138,7 @@ class LawAtPoints:
 
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
-        """All components of the new state in one vector, and the shapes of the state."""
+        """Expression of all components of the new state as one vector, and the shapes of the state variables."""
         what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
         new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return names and values (n, ...) of the state at the end of a step of dt, s, from F at the end."""
+        """Return names and values (n, ...) of the state at the end of a step; data have F at the end; dt: step, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -162,9 +162,9 @@ class LawAtPoints:
 
 
 def knows_space(grid: Grid, m: Skeleton) -> bool:
-    """Return whether a material's law takes F (3, 3) in plane strain; a user-defined law may be for the plane only.
+    """Return whether a material's law accepts F (3, 3) in plane strain; some user-defined laws accept F (2, 2) only.
 
-    m: material with constants as arrays over one point.  The result is True for laws with local unknowns.
+    m: material with constants as arrays for one point.  The result is True for laws with local unknowns.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -174,7 +174,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
     given = {name: fem.Constant(grid.mesh, value) for name, value in values.items()}
     given |= {name: fem.Constant(grid.mesh, np.asarray(value, dtype=float)) for name, value in law.state.items()}
     F = ufl.variable(FormPoints(grid, F=(3, 3)).F)
-    log = logging.getLogger("UFL")  # it logs errors before it raises
+    log = logging.getLogger("UFL")  # UFL logs errors before it raises them
     log.disabled, before = True, log.disabled
     try:
         law_of_F = expression(function, [shape], F=F, **given, **by_scene(grid))
@@ -189,9 +189,9 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws as UFL constants; the time must be set.
+    """Return the arguments `BY_SCENE` of laws as UFL constants; the caller sets the value of the time.
 
-    points: points of the law; on grids of several cell sizes they carry their cell size.
+    points: integration points of the law; on grids of several cell sizes they store their cell size.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -201,28 +201,28 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube as large as a cell, m; on grids of several sizes, as the largest cell."""
+    """Return the edge of a square or cube with the volume of a cell, or of the largest cell of the grid, m."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
 
 MOST = 100.0
-"""Upper limit of the softness; perfectly plastic flow has no stiffness.
+"""Upper limit of the softness (elastic / tangent shear modulus), which is infinite in perfectly plastic flow.
 
-Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-03, twice by 5.0e-03, finer cells by 3.0e-02.
 """
 
 
 class SoftnessAtPoints:
     """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
 
-    Volume changes that alternate from cell to cell grow with the strain.  The balancing pressures are these volume
-    changes over the damping strength tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau must then
-    follow the tangent; otherwise the alternating pressures reach the strength of the soil.
+    Volume strains that alternate from cell to cell grow with the strain.  The pressure that balances such a volume
+    strain is volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant
+    stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent shear modulus
-    is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  It is taken from the step before.  A value from the present iterate
-    would prevent convergence of Newton's method, or make the result depend on the iterates.
+    is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
+    current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ class SoftnessAtPoints:
     def __call__(
         self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64], dt: float
     ) -> NDArray[np.float64]:
-        """Return the softness (n,) of points with F, parameters and state, in [1, MOST].
+        """Return the softness (n,), in [1, MOST], of points with F, parameters and state.
 
         dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa; dt: length of the step, s.
         """
@@ -270,7 +270,7 @@ class SoftnessAtPoints:
 
 
 class ConductivityAtPieces:
-    """Conductivities that depend on deformation and position, evaluated at the pieces.
+    """Conductivities that depend on deformation and position, evaluated at pieces of particle domains.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Points with the fields F, position, conductivity and porosity0, if a material has a conductivity law.
+        Integration points of the pieces: fields F, position, conductivity and porosity0, if a law is given.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -298,7 +298,7 @@ class ConductivityAtPieces:
         self._materials = materials
         self._u = displacement
         self.by_pressure = any("p" in signature(law).parameters for law in laws)
-        """Whether a law takes p."""
+        """Whether a law depends on the pore pressure p."""
         self._p = pressure
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 
@@ -318,12 +318,12 @@ class ConductivityAtPieces:
         )
 
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
-        """Return the conductivities (m,), m/s, at u of pieces of the given materials (m,).
+        """Return the conductivities (m,), m/s, of pieces with material indices (m,), at the present displacement.
 
         Raises
         ------
         ValueError, NotConverged
-            A conductivity is negative or not finite: the first at the start of a step, the second at an iterate.
+            A conductivity is negative or not finite: ValueError at the start of a step, NotConverged at an iterate.
         """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():
@@ -339,7 +339,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three states, as its fingerprint."""
+    """Return the conductivities of a law in three deformation states, as a fingerprint of the law."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Materials of a scene at its points: parameters as functions of position, state, several laws."""
+"""Materials of a scene at its material points: parameters as functions of position, states, several laws."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ RESERVED = frozenset(
 """Reserved names of quadrature point data, not available for parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""Change of the state from rest at which a point counts as yielded.
+"""Change of a state variable from its initial value above which a point counts as yielded.
 
-Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 6.6e-05, twice by 1.4e-04, finer cells by 3.0e-02.
 """
 STIFFEST = 100.0
-"""Upper limit of (stiffness of trapped pore fluid) / (modulus of the skeleton); it limits rounding errors.
+"""Upper limit of alpha^2 / S, divided by the skeleton's modulus lambda + 2G; it limits rounding errors.
 
-Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 1.2e-07, twice by 1.0e-07, finer cells by 3.0e-02.
 """
 
 
@@ -53,15 +53,15 @@ class SceneMaterials:
     grid
         Background grid.
     materials
-        Materials, in the order of the indices of bodies.
+        Materials, in the order of the bodies' material indices.
     bodies
         All bodies; fields are evaluated at their reference positions.
     points
-        The points of this process, as seeded.
+        Material points of this process, as seeded.
     fluid
         Pore fluid, if there is one.
     prestressed
-        Whether points may have a stress as seeded.
+        Whether points may have an initial stress.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SceneMaterials:
         each = zip(self._used, evaluated, in_space, strict=True)
         known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
-        """Number of axes of the deformation gradients of laws."""
+        """Size of the deformation gradients of laws, 2 or 3."""
         if self.across:
             seeded[ACROSS] = np.ones(len(points))
         if prestressed:
@@ -106,22 +106,22 @@ class SceneMaterials:
             max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
             for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
         )
-        """Whether points differ in stiffness by more than a factor of two."""
+        """Whether stiffness differs between points by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated) or any(
             callable(m.conductivity) for m in used
         )
-        """Whether fluid flows anywhere, or may in a later stage."""
+        """Whether fluid flows in the scene, or may flow in a later stage."""
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
         self.layered = self.layered or len({m.retention for m in used}) > 1
-        """Whether the conductivity may vary from point to point."""
+        """Whether the conductivity may differ between points."""
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Fingerprints of fields and of laws of flow, for checkpoints."""
+        """Fingerprints of parameter fields and of laws of flow, for checkpoints."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -132,12 +132,12 @@ class SceneMaterials:
             values = {name: getattr(m, name) for name in self._fields[i]}
             count = sum(len(body) for body in bodies if body.material == i)
             self._add_shapes(_expanded(m, values, count), seeded, len(points))
-            here, rows = _rows(bodies, i, points.id)
+            found, rows = _rows(bodies, i, points.id)
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
                 self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
                 filled = np.zeros((len(points), *value.shape[1:]))
-                filled[here] = value[rows]
+                filled[found] = value[rows]
                 seeded[name] = filled + seeded[name] if name in seeded else filled
         seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
@@ -152,28 +152,28 @@ class SceneMaterials:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
                     self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
-        """The points with their initial data: parameters as functions of position, and state."""
+        """The material points with their initial data: parameters that are functions of position, and state."""
         self._at_points = [
             LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
             for law in self.laws
         ]
 
     def check_cells(self) -> None:
-        """Raise ValueError if cells are too large for a softening law, when they are made or have moved."""
+        """Raise ValueError if cells are too large for a softening law; called when the cells are made or have moved."""
         for m in self._evaluated:
             m.check_cells(mean_size(self.grid))
 
     @property
     def across(self) -> bool:
-        """Whether laws take a stretch out of plane in plane strain, from the mean dilatation."""
+        """Whether some laws in plane strain use an out-of-plane stretch, given by the mean dilatation."""
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
-        """Return the number of axes of a law's deformation gradients."""
+        """Return the size of a law's deformation gradients, 2 or 3."""
         return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
-        """Add the shapes of a law's parameters and state, and seed the state of `count` points."""
+        """Add the shapes of a law's parameters and state, and initialise the state of `count` points."""
         law = type(m)
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
@@ -190,12 +190,12 @@ class SceneMaterials:
         if "suction" in law.state and self.fluid is not None and m.retention is None:
             raise ValueError(f"{law.__name__}: retention = None, must be a retention curve for a law with suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
-            what = "has unknowns and takes cell_size, must not with cells of several sizes"
+            what = "has unknowns and depends on cell_size, must not be used with cells of several sizes"
             raise ValueError(f"{law.__name__}: {what}")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*constants_of(m), *law.state])
-                raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
+                raise ValueError(f"{law.__name__}: argument {name!r} of its functions, must be F or one of {known}")
             value = _known(f"{law.__name__}: {name}", getattr(m, name))
             self._set_shape(law, name, value.shape[1:])
         for name, value in law.state.items():
@@ -211,10 +211,10 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return each law with points for its pieces, and whether Q1 cells would lock.
+        """Return (law, integration points, whether Q1 cells would lock) for each part of the scene's points.
 
-        If some materials of a law lock and others do not, the law has two parts.  A single part uses `pieces` itself.
-        With several parts the points have the fields `common`, and parameters and state of their law.
+        If a law has nearly incompressible materials and others, its points are split in two.  A single part uses
+        `pieces`.  Several parts have their own integration points: fields `common`, parameters and state of the law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -227,11 +227,11 @@ class SceneMaterials:
         return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's part (n,), see `parts`."""
+        """Return the index of each point's part (n,), see `parts`."""
         return self._part[points.material]
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's law (n,)."""
+        """Return the index in `laws` of each point's law (n,)."""
         return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
@@ -239,17 +239,17 @@ class SceneMaterials:
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) laws take a stretch out of plane from the mean dilatation."""
+        """Return at which points (n,) laws use the out-of-plane stretch given by the mean dilatation."""
         return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) laws accept a stretch out of plane."""
+        """Return at which points (n,) laws accept an out-of-plane stretch."""
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return rows (n, 2), equal for points of equal conductivity: conductivity, m/s, and number of the law.
+        """Return a key (n, 2) of each point, equal for equal conductivities: conductivity, m/s, and index of the law.
 
-        With a law of position all rows differ.  The fractional part of the number distinguishes retention curves.
+        With a law that depends on position all keys differ.  The fraction of the index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -267,7 +267,7 @@ class SceneMaterials:
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return S, its slope, 1/Pa, chi and k_r at pressures (m,), Pa, of some points (m,), by default all."""
+        """Return S, dS/dp, 1/Pa, chi and k_r at pressures p (m,), Pa, of the points with indices `of`, or of all."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -282,7 +282,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return S, its slope, 1/Pa, chi and k_r at pressures (m,), Pa, for rows (m, width): see `SaturationAt`."""
+        """Return S, dS/dp, 1/Pa, chi and k_r at pressures p (m,), Pa; rows (m, width): field `retention` of points."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -291,18 +291,18 @@ class SceneMaterials:
         return np.array(scales)[points.material]
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the contribution of the pore pressure to the total stress at the points (n,), Pa: alpha chi p."""
+        """Return the pressure alpha chi p (n,), Pa, that is subtracted from the effective stress at the points."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
     def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the rows (n, width) of the points' retention curves, see `Retentions`."""
+        """Return the field `retention` (n, width) of the points, see `Retentions`."""
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
+        """Return value(material, *columns) at the points (n, ...); columns (n,): values at the points.
 
-        `value` returns one value a point or a single number; for a uniform material without columns also one (...).
+        `value` returns one value per point, or one number; for a uniform material without columns also one value (...).
         """
         each, shapes = [], set()
         for i in self._used:
@@ -321,7 +321,7 @@ class SceneMaterials:
         Raises
         ------
         ValueError
-            Fields out of their range.
+            A field is out of its range.
         """
         data = dict(points.data)
         for i in self._used:
@@ -338,7 +338,7 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material with constants as arrays over some of its points; uniform materials remain unchanged."""
+        """Return a material with its constants as arrays over points `rows`; a uniform material is returned as is."""
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}
@@ -388,11 +388,11 @@ class SceneMaterials:
 
     @property
     def drains(self) -> bool:
-        """Whether pores drain as a free surface falls."""
+        """Whether pores drain as the phreatic surface falls."""
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return (n, 2): specific yield at the points, and suction, Pa, for its full drainage."""
+        """Return the specific yield of the points and the suction, Pa, at which it has drained, as an array (n, 2)."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -405,7 +405,7 @@ class SceneMaterials:
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
     def present_density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil and its pore water at the points (n,), kg/m^3."""
+        """Return the density of soil with the pore water that it contains, at the points (n,), kg/m^3."""
         density = self.density(points)
         if self.retentions is None:
             return density
@@ -415,7 +415,7 @@ class SceneMaterials:
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the undrained confined modulus (n,), Pa: lambda + 2G + alpha^2 / S.
 
-        The last term is at most `STIFFEST` (lambda + 2G).
+        alpha^2 / S is limited to `STIFFEST` (lambda + 2G).
         """
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
@@ -428,7 +428,7 @@ class SceneMaterials:
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) the state of a law has changed from rest."""
+        """Return at which points (n,) a state variable has changed from its initial value."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = (law_of == number).nonzero()[0]
@@ -442,15 +442,15 @@ class SceneMaterials:
 
     @property
     def some_elastic(self) -> bool:
-        """Whether any law has no history."""
+        """Whether any law is elastic, without a state."""
         return any(not law.state for law in self.laws)
 
     def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return the points (n,) whose law has no history."""
+        """Return which points (n,) have an elastic law, without a state."""
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return rows (n, c) that are equal at points of the same elastic soil, whatever its initial stress."""
+        """Return a key (n, c) of each point, equal for equal elastic constants, for any initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -466,9 +466,9 @@ class SceneMaterials:
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, at the points; a collective call.
+        """Return the effective Cauchy stress (n, d, d), Pa, at the points; in axisymmetry (n, 3, 3).
 
-        In axisymmetry (n, 3, 3).
+        All processes must call it.
         """
         out, d = np.zeros_like(points.F), self.grid.stretches
         for law, rows, data in self._placed(points):
@@ -476,16 +476,16 @@ class SceneMaterials:
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa, also out of plane; a collective call."""
+        """Return the effective Cauchy stress (n, 3, 3), Pa, at the points; all processes must call it."""
         out = np.zeros((len(points), 3, 3))
         for law, rows, data in self._placed(points):
             out[rows] = law.stress_3d(data)
         return out
 
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; a collective call.
+        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; all processes must call it.
 
-        For laws without an energy it is Hencky's energy with constant moduli if `elastic_hencky`, else zero.
+        For laws without an energy, this is Hencky's energy with constant moduli if `elastic_hencky`, else zero.
         """
         out = np.zeros(len(points))
         bulk, shear = (self.table(points, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
@@ -500,13 +500,13 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; a collective call."""
+        """Return the total Cauchy stress, Pa, in the shape of `effective_stress`; all processes must call it."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of dt, s, for points with F at its end; before: points at its start.
+        """Return the point data after a step of dt, s; before: points at the start; points: with F at the end.
 
         Raises
         ------
@@ -537,7 +537,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return every law with the indices and the data of its points."""
+        """Return every law with the indices and the form data of its points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -545,7 +545,7 @@ class SceneMaterials:
 
 
 def _known(name: str, value) -> NDArray[np.float64]:
-    """Return a parameter or state of a law as an array; infinity is allowed, nan is not."""
+    """Return a parameter or state of a law as an array; infinity is allowed, NaN raises ValueError."""
     out = numbers(name, value, None, allowed="numbers", test=np.isreal)
     if np.isnan(out).any():
         raise ValueError(f"{name} = nan, must be numbers")
@@ -567,7 +567,7 @@ def _takes(law: type[Skeleton]) -> list[str]:
 
 
 def _used(bodies: Sequence[Body], count: int) -> list[int]:
-    """Return the indices of the bodies' materials, ascending; count: number of materials."""
+    """Return the indices of the materials that bodies have, ascending; count: number of materials."""
     for body in bodies:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
@@ -575,17 +575,17 @@ def _used(bodies: Sequence[Body], count: int) -> list[int]:
 
 
 def _by_place(m: Skeleton) -> list[str]:
-    """Return the names of a material's constants that are functions of position."""
+    """Return the names of the constants of a material that are functions of position."""
     return [name for name in constants_of(m) if callable(getattr(m, name))]
 
 
 def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
-    """Return a material with its constants evaluated at all its points, see `_places`."""
+    """Return a material with its constants evaluated at all points of the material, see `_places`."""
     return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
 
 
 def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
-    """Return a material with its constants as arrays over the first of its points."""
+    """Return a material with its constants as arrays for the first of its points."""
     return _expanded(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
 
 
@@ -595,23 +595,23 @@ def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
 
 
 def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices (m,) of points with a material, and their rows among all its points, see `_places`."""
-    here = []
+    """Return the indices (m,) of points with a material, and their rows in the result of `_places`."""
+    found = []
     rows = []
     start = 0
     before = 0
     for body in bodies:
         if body.material == material:
             of_body = ((ids >= start) & (ids < start + len(body))).nonzero()[0]
-            here.append(of_body)
+            found.append(of_body)
             rows.append(ids[of_body] - start + before)
             before += len(body)
         start += len(body)
-    return np.concatenate(here), np.concatenate(rows)
+    return np.concatenate(found), np.concatenate(rows)
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
-    """Return a copy of a material with values (n, ...) of some fields, its other numbers repeated n times."""
+    """Return a copy of a material with values (n, ...) of some fields, and its other numbers repeated n times."""
     out = copy(m)
     for name in constants_of(m):
         value = getattr(m, name)

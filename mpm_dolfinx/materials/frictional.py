@@ -18,7 +18,7 @@ GIVEN = {
 
 @dataclass(frozen=True, kw_only=True)
 class Frictional(Skeleton):
-    """Elastic, perfectly plastic or hardening soil with friction: base of such laws.
+    """Base of laws for frictional soil, perfectly plastic or hardening.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Frictional(Skeleton):
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     dilates: ClassVar = True

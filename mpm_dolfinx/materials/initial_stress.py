@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Initial effective stresses, prescribed or from the overburden, and the corresponding elastic strains."""
+"""Initial effective stresses, prescribed or computed from the overburden, and the corresponding elastic strains."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 from mpi4py import MPI
 
@@ -24,25 +25,26 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
-EXACT, CLOSE = 1e-13, SAME  # over the largest initial stress: accuracy aimed at, and required
-MOST = 30  # iterations
-LARGEST = 0.2  # change of a strain in an iteration
+EXACT, CLOSE = 1e-13, SAME  # errors of the stress / largest initial stress: at which Newton's method ends, and allowed
+MOST = 30  # Newton iterations
+LARGEST = 0.2  # change of a strain component in one iteration
 
 
 @dataclass(frozen=True, eq=False)
 class K0:
-    """Initial effective stress of soil at rest under its own weight.
+    """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical stress is the overburden of soil and fluid plus the surcharge, less biot times the pore pressure.  The
-    horizontal stresses, radial and circumferential in axisymmetry, are K0 times this.  They are exact for level ground
-    and layers; otherwise an equilibrium step follows, with a warning if it changes them by more than 5 %, as on slopes.
+    The vertical stress is the overburden of soil and fluid plus the surcharge, minus biot times the pore pressure.  The
+    horizontal stresses (radial and circumferential in axisymmetry) are K0 times the vertical stress.  These stresses
+    are exact for level ground with level layers.  Otherwise an equilibrium step follows.  A warning is given if it
+    changes them by more than 5 %, as on slopes.
 
     Parameters
     ----------
     ratio
         K0, >= 0: a number, or a function of the reference positions X (n, d), m.
     surcharge : number or callable x (n, d) -> (n,), Pa
-        Pressure on the surface, >= 0, at positions x on it, for example of still water above.
+        Pressure on the ground surface, >= 0, at positions x on the surface, for example of standing water above.
     """
 
     ratio: Field
@@ -58,7 +60,7 @@ class K0:
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return ratio or surcharge at positions (n, d), m: one value or (n,)."""
+        """Return the ratio or surcharge at positions x (n, d), m: one value or (n,)."""
         value = getattr(self, name)
         given = at_places(f"K0: {name}", "one value a place", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
@@ -68,17 +70,17 @@ InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
 
 
 def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
-    """Return the hydrostatic pressure below a phreatic level, a function of positions x (n, d) for `pressure`.
+    """Return the hydrostatic pressure below a phreatic level as a function of positions x (n, d), for `pressure`.
 
-    The pressure above the level is negative: suction.
+    Above the level the pressure is negative (suction).
 
     Parameters
     ----------
     level
         Height, m, along the last axis.
     unit_weight
-        Unit weight of the fluid, N/m^3, > 0; by default of the scene's fluid, outside a scene 9810.  A warning appears
-        if it differs from the scene's fluid.
+        Unit weight of the fluid, N/m^3, > 0; by default that of the scene's fluid, or 9810 outside a scene.  A warning
+        is given if the value differs from that of the scene's fluid.
     """
     numbers("hydrostatic: level", level)
     if unit_weight is not None:
@@ -89,7 +91,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, N/m^3; default: unit weight of the scene's fluid, outside a scene 9810."""
+    """A water pressure with a unit weight, N/m^3; by default that of the scene's fluid, or 9810 outside a scene."""
 
     @property
     def unit_weight(self) -> float:
@@ -110,7 +112,7 @@ class Hydrostatic(OfWater):
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
-    """Return the initial stress of each body; a single one holds for all bodies present at the start."""
+    """Return the initial stress of each body; a single one applies to all bodies present at the start."""
     allowed = "a K0, a function of x, or one of these for each of some bodies, {index: ...}"
     if given is None:
         return {}
@@ -142,14 +144,14 @@ class InitialStresses:
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
-        """Return points with the elastic strains of their initial stress; a collective call.
+        """Return the points with the elastic strains of their initial stress; all processes must call it.
 
         Parameters
         ----------
         present
-            Which bodies are present, for the overburden.
+            Whether each body is present, for the overburden.
         gravity : (d,), m/s^2
-            Acceleration, or None.
+            Acceleration of gravity, or None.
         """
         if not self.given:
             return points
@@ -171,7 +173,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress (n, 3, 3), Pa, of some points of a body."""
+        """Return the effective stress (n, 3, 3), Pa, of points of a body; above: see `_above`."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -194,37 +196,37 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return, for K0, overburden, Pa, height of the surface, m, and biot times pore pressure, Pa, at the points."""
+        """Return overburden, Pa, surface height, m, and biot times pore pressure, Pa, at the points, for K0."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
             g = None if gravity is None else np.asarray(gravity).tolist()
-            raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, must point down along the last axis at the start")
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
-            raise ValueError("initial_stress: K0 without gravity at the start, nor a surcharge: must have one of these")
+            raise ValueError("initial_stress: K0 without gravity at the start or surcharge, must have one of them")
         # the densities of all points on all processes
         seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.present_density(seeded)
         total = over_all(materials.grid.comm, total)
-        here = np.repeat(present, [len(body) for body in self._bodies])
-        corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
+        used = np.repeat(present, [len(body) for body in self._bodies])
+        corners = np.concatenate([body.corners() for body in compress(self._bodies, present)])
         base = materials.grid.base
-        weight, surface = overburden(corners - base, -gravity[-1] * total[here], points.x)
+        weight, surface = overburden(corners - base, -gravity[-1] * total[used], points.x)
         return [weight, surface + base[-1], materials.pore_stress(points)]
 
 
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return points with target stresses (n, 3, 3), Pa, at the chosen ones (n,); a collective call.
+    """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter; elsewhere elastic strain causes it, see `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter; in other laws elastic strain: `_ElasticStrains`.
 
     Raises
     ------
     ValueError
-        A stress is outside the yield surface; the message names the first such position.
+        A stress is outside the yield surface; the message states the first such position.
     """
     comm = materials.grid.comm
     rows = np.flatnonzero(chosen)
@@ -251,10 +253,10 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method.
+    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved.
 
-    The unknown is the symmetric logarithm of `seeded_stretch` or of C_p^-1; points: n points; target (n, 3, 3): stress,
-    Pa; given (n,): whether the stress is a parameter; plastic (n,): whether the law has C_p^-1.
+    points: n points; target (n, 3, 3): stress, Pa.
+    given (n,): whether the stress is a parameter; plastic (n,): whether C_p^-1 is a state variable.
     """
 
     materials: SceneMaterials
@@ -265,7 +267,7 @@ class _ElasticStrains:
 
     @property
     def components(self) -> tuple[tuple[int, int], ...]:
-        """The k components of a symmetric tensor."""
+        """Indices of the k components of a symmetric tensor."""
         return PLANE if self.points.x.shape[1] == 2 else SPACE
 
     @property
@@ -286,7 +288,7 @@ class _ElasticStrains:
         return self.materials.table(self.points, bulk), self.materials.table(self.points, shear)
 
     def linear(self) -> NDArray[np.float64]:
-        """Return the strains (n, k) of a linear law."""
+        """Return the elastic strains (n, k) of the target stresses in linear elasticity."""
         (bulk, shear) = self.moduli()
         target = self.target
         identity = np.eye(3)
@@ -296,7 +298,7 @@ class _ElasticStrains:
         return self.of(elastic)
 
     def residual(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
-        """Return points with elastic strains (n, k), and their stresses minus the target, Pa (n, k)."""
+        """Return the points with elastic strains (n, k), and their stresses minus the target stresses (n, k), Pa."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
@@ -309,7 +311,7 @@ class _ElasticStrains:
         return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the strains (n, k) after a Newton step with finite differences; missing: stress minus target, Pa."""
+        """Return the strains (n, k) after a Newton step with finite differences; missing (n, k): residual, Pa."""
         count = strain.shape[1]
         free = self.free
         (_, shear) = self.moduli()
@@ -324,10 +326,10 @@ class _ElasticStrains:
         return np.clip(strain - change, -1, 1)
 
     def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return points with the strains, and which points (n,) miss the target."""
+        """Return the points with elastic strains, and which points (n,) do not reach their target stress."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
-        close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # round-off for very small strains
+        close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains
         now = self.points
         missed = np.ones(len(strain), dtype=bool)
         try:
@@ -344,7 +346,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return points, not moved, with the elastic strains of `moved`, their deformed copies."""
+    """Return the points at their positions, with the elastic strains of `moved`, the same points after deformation."""
     F = moved.F_of_laws
     d = F.shape[1]
     law = materials.law_of(points)
@@ -365,7 +367,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
 
 
 def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
-    """Return points with new values (n, ...) at the chosen ones (n,), for names that the points have."""
+    """Return the points with new values (n, ...) at the chosen points (n,); names that the points lack are ignored."""
     data = dict(points.data)
     for name, new in values.items():
         if name in data and chosen.any():
@@ -383,7 +385,7 @@ def _prestretch(m) -> NDArray[np.float64]:
 
 
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
-    """Return an error message for stresses (n, 3, 3) that cannot be constants of Modified Cam Clay, or an empty one."""
+    """Return an error message for stresses (n, 3, 3), Pa, that Modified Cam Clay excludes, or an empty string."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
     invalid = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
     what = "must have no shear and a compressive mean for ModifiedCamClay"

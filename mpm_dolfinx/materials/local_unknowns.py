@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Local unknowns of laws, determined by equations at each point.
 
-A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points at once, to
-round-off.  The forms contain
+A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points together,
+with errors of round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress in y and F is then
-the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  A stress without a
-derivative uses y* alone.  The stress of a law with an energy is itself a derivative.  There y has a second-order term,
-and its coefficients also follow from f = 0.  A law may instead return y(z) and its derivative in numpy.
+with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress with respect to y
+and F is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  If the
+stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.  Then y
+has a second-order term, whose coefficients also follow from f = 0.  A law in numpy may instead return y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
 from mpm_dolfinx.parallel.exchange import first
 
-MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
+MOST, HALVINGS = 60, 25  # Newton iterations, and step halvings in all iterations together
 
 
 class Solved(NamedTuple):
@@ -45,7 +45,7 @@ class Solved(NamedTuple):
 
 
 class Derived(NamedTuple):
-    """Derivatives by the trial values: slopes Y (n, m k); second ones, bends (n, m k k), for laws with an energy."""
+    """Derivatives with respect to the trial values: slopes Y (n, m k); for laws with an energy bends (n, m k k)."""
 
     slopes: NDArray[np.float64]
     bends: NDArray[np.float64] | None = None
@@ -70,8 +70,8 @@ class LocalUnknowns:
     values
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
-        The unknowns and `trial` for expressions without a derivative with respect to F: kernels skip the trial values.
-        Laws with an energy have the same as `values`.
+        The unknowns and `trial`, for expressions that are not differentiated with respect to F: kernels then skip the
+        trial values.  For laws with an energy it equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -81,7 +81,7 @@ class LocalUnknowns:
         given = {"trial": trial}
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
         if not trial:
-            raise ValueError(f"{law.__name__}.trial: gives {line(given['trial'])}, must have some UFL of F")
+            raise ValueError(f"{law.__name__}.trial: returns {line(given['trial'])}, must have some UFL of F")
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()
@@ -98,7 +98,7 @@ class LocalUnknowns:
         # component by component: in 3D products of tensors take ten times as long to compile
         off = [z[j] - at["trial"][j] for j in range(k)]
         y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
-        if bends:  # the tangent contains the second derivative of the unknowns by F
+        if bends:  # the tangent contains the second derivative of the unknowns with respect to F
             for i, (j, l) in product(range(m), combinations_with_replacement(range(k), 2)):
                 y[i] += at["bends"][i, k * j + l] * off[j] * off[l] / (2 if j == l else 1)
         shapes = {name: np.shape(start) for name, start in law.unknowns.items()}
@@ -106,14 +106,14 @@ class LocalUnknowns:
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
     def update(self, data: PointData, derive: bool = True) -> None:
-        """Solve for the local unknowns of the points at their present F, and differentiate them; a collective call.
+        """Solve for the local unknowns of the points at their present F; all processes must call it.
 
-        derive: whether the next expression depends on `values`, not on `known` alone.
+        derive: also differentiate the unknowns, for expressions that depend on `values`, not on `known` alone.
 
         Raises
         ------
         NotConverged
-            No solution; the message names the first such point.
+            A point has no solution; the message states the first such point.
         """
         trial = self._trial.evaluate(data)
         self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
@@ -121,14 +121,14 @@ class LocalUnknowns:
             self.derive(data)
 
     def derive(self, data: PointData) -> None:
-        """Differentiate the last solution of the unknowns with respect to F; a collective call."""
+        """Differentiate the last solution of the unknowns with respect to F; all processes must call it."""
         solved = self._at(data)
         self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
 
     def _at(self, data: PointData) -> Solved:
         solved = self._solved.value
         if solved is None or solved.key is not data.key:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are solved")
+            raise RuntimeError(f"{self._law.__name__}: local unknowns are used before they are solved")
         return solved
 
     def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
@@ -137,12 +137,12 @@ class LocalUnknowns:
             return getattr(solved, what)
         of, derived = self._derived.value or (None, None)
         if of is not solved:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are derived")
+            raise RuntimeError(f"{self._law.__name__}: derivatives of local unknowns are used before they are computed")
         return getattr(derived, what)
 
 
 class _Equations:
-    """The equations f(y, z) = 0 of a law at points with their arguments."""
+    """The equations f(y, z) = 0 of a law, as functions of data at the points."""
 
     def __init__(
         self,
@@ -184,11 +184,11 @@ class _Equations:
             self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
-        """Return trial values under the argument names of the law's equations."""
+        """Return the trial values by the argument names of the law's equations."""
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution at points with trial values (n, k); a collective call."""
+        """Return the solution at points with trial values (n, k); all processes must call it."""
         if self._law.residual is None:
             return self._in_numpy(data, trial)
         m, n = self.count, len(trial)
@@ -220,13 +220,13 @@ class _Equations:
         return Solved(data.key, y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged if a point on any process is lost, with the first such point; a collective call."""
+        """Raise NotConverged on all processes if a point of any process has failed; the message states the first."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the local unknowns of a law that has a numpy function `solution`."""
+        """Return the local unknowns of a law with the numpy function `solution`."""
         n, k, values, start = *trial.shape, {}, 0
         for name, shape in self._trial.items():  # copies, because a law may change its arguments
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
@@ -249,7 +249,7 @@ class _Equations:
         return Solved(data.key, y, trial, derive)
 
     def _concatenated(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
-        """Return arrays side by side; a ValueError on one process is raised on all."""
+        """Return arrays concatenated along axis 1; a ValueError on one process is raised on all processes."""
         arrays, reason = [], ""
         try:
             arrays = make()
@@ -264,12 +264,12 @@ class _Equations:
         return f"{self._law.__name__}.solution"
 
     def _checked(self, found, n: int) -> dict:
-        """Return the checked result of a law in numpy at n points: unknowns and derivatives as real arrays.
+        """Return the checked result of `solution` at n points: unknowns and their derivatives as real arrays.
 
         Raises
         ------
         ValueError
-            The result is no dict of pairs with the unknowns' names and shapes, or has a derivative by another name.
+            The result is no dict of pairs with names and shapes of the unknowns, or a derivative has an unknown name.
         """
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
@@ -278,14 +278,14 @@ class _Equations:
                 raise ValueError(f"{self._title}: {of} = {line(pair)}, {allowed}")
         if set(found) != set(self._unknowns):
             names = (", ".join(map(str, of)) or "nothing" for of in (found, self._unknowns))
-            raise ValueError("{}: gives {}, must give {}".format(self._title, *names))
+            raise ValueError("{}: returns {}, must return {}".format(self._title, *names))
         out = {}
         for of, shape in self._unknowns.items():
             values, slopes = found[of]
             for by in slopes:
                 if by not in self._trial:
                     among = ", ".join(self._trial)
-                    raise ValueError(f"{self._title}: derivative of {of} by {line(by)}, must be by some of {among}")
+                    raise ValueError(f"{self._title}: derivative of {of} by {line(by)}, must be by one of {among}")
             known = {by: slope if callable(slope) else self._slope(of, by, slope, n) for by, slope in slopes.items()}
             out[of] = _real(f"{self._title}: {of}", values, (n, *shape)), known
         return out
@@ -297,7 +297,7 @@ class _Equations:
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the slopes (n, m, k) of one unknown; given: its derivatives with respect to some trial values."""
+        """Return the derivatives (n, m, k) of one unknown; given: derivatives by name of the trial value."""
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
             slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))
@@ -326,7 +326,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return the failed points.
 
-    system: takes rows (r,) and values (r, m), sets these, and returns f (r, m), df/dy (r, m, m) and norms (r,).
+    system: function of indices (r,) and values (r, m).  It sets the values, and returns f, df/dy and norms of f (r,).
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
@@ -334,7 +334,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     for _ in range(MOST):
         step, old = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
         solved, failed[rows] = norm <= 4 * EPSILON, ~np.isfinite(step).all(axis=1)
-        step[solved & failed[rows]] = 0.0  # a solution, though it may be one of many
+        step[solved & failed[rows]] = 0.0  # a solution, which may not be unique
         failed[rows] &= ~solved
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
         y[rows] = old - step  # for close points this is the solution
@@ -362,7 +362,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A^-1 b (n, m, k) of matrices (n, m, m); not finite for a singular matrix."""
+    """Return A^-1 b (n, m, k) for matrices A (n, m, m); the result is not finite for a singular matrix."""
     with np.errstate(all="ignore"):
         if A.shape[1] == 1:
             return b / A
@@ -387,7 +387,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return the tensors of given shapes that are consecutive in a UFL vector."""
+    """Return tensors of the given shapes, whose components are consecutive in a UFL vector."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

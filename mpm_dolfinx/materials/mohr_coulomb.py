@@ -6,11 +6,11 @@ stresses t_1 >= t_2 >= t_3, tension positive,
 
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
-flow is along (1 + sin psi) e_i - (1 - sin psi) e_j and along e_i.  The return keeps the order of the principal values,
-so it ends on one of eleven faces, edges and vertices (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).
-On each of them the stress is linear in the trial stress.  An end is valid if the stress is admissible, the order is
-kept, and all plastic multipliers are >= 0.  The end with the least violation is taken; its violation is round-off.
-The computation is in numpy, with exact derivatives also for equal principal values, as on the edges.
+flow is along (1 + sin psi) e_i - (1 - sin psi) e_j and along e_i.  The return mapping keeps the order of the principal
+values.  It therefore ends on one of ten faces, edges and vertices, `_Return` (de Souza Neto, Peric and Owen 2008, 8.2,
+without the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
+admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the least violation is used;
+the violation is round-off.  The computation is in numpy.  Derivatives are exact also for equal principal values.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
-NEVER = 1e6  # default tensile strength over the bulk modulus
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the candidates for the return
+NEVER = 1e6  # default tensile strength / bulk modulus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,19 +42,19 @@ class MohrCoulomb(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, with the undrained strength `cohesion`.
     dilation
-        Dilation angle psi, degrees, in [0, friction].  At the friction angle flow is associated, and the tangent is
-        symmetric.  Soil torn apart at the apex dilates for any angle.
+        Dilation angle psi, degrees, in [0, friction].  If it equals the friction angle, flow is associated and the
+        tangent is symmetric.  Soil in tension at the apex dilates at any angle.
     cohesion
-        Cohesion c, Pa, >= 0.  With zero, points without pressure have no stiffness.
+        Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
-        Tensile strength T, Pa, >= 0, an upper limit of the principal stresses.  By default the apex, c cot phi.
+        Tensile strength T, Pa, >= 0: upper limit of the principal stresses.  By default that at the apex, c cot phi.
 
     Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
 
     Raises
     ------
     ValueError
-        A constant out of its range, or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
     """
 
     tension: Field = np.inf
@@ -84,21 +84,21 @@ class MohrCoulomb(Frictional):
 
     @property
     def cutoff(self):
-        """Tensile strength, finite, Pa."""
+        """Tensile strength, Pa, limited to a finite value."""
         return np.minimum(self.tension, NEVER * self.bulk)
 
     @staticmethod
     def trial(F, plastic):
-        """Return the components of the trial elastic strain b."""
+        """Return the components of the trial elastic tensor b = F C_p^-1 F^T."""
         F3 = embedded(F)
         b, plane = F3 * plastic * F3.T, planar(F)
         return {"b": components(b, plane), "F": (F3, plane)}
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return the components of the stress at the end, Pa, with their derivatives, and whether there was flow."""
+        """Return the components of the stress at the end, Pa, with derivatives, and whether there was plastic flow."""
         x, axes = eigen(trial["b"])
-        with np.errstate(invalid="ignore", divide="ignore"):  # of a diverging iterate, which is refused later
+        with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
         order = np.argsort(-e, axis=1, kind="stable")
         undo, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
@@ -127,16 +127,16 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return the principal stresses, Pa, for ordered principal trial strains.
+    """Return the principal Kirchhoff stresses, Pa, for ordered principal trial strains.
 
     Parameters
     ----------
     e : (n, 3)
-        Strains, the largest first; the parameters (n,) follow.
+        Principal strains, the largest first; the other arguments are parameters (n,).
 
     Returns
     -------
-    Stresses (n, 3), their derivatives with respect to the strains (n, 3, 3), and 1 in plastic flow (n,).
+    Stresses (n, 3); derivatives with respect to the strains (n, 3, 3); 1 in plastic flow, else 0 (n,).
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
@@ -145,7 +145,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
         parameters = elastic, bulk, shear, sine, sine_flow, *limits
 
         trial, rows = t.copy(), np.flatnonzero(flows)
-        for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
+        for few in (FACE, EDGES, ALL):  # the main face is valid for most points, an edge for most others
             at = _Return(trial[rows], *(v[rows] for v in parameters))
             ends, of_trial, violation = at.end(few)
             accepted = violation <= NEAR**2 * shear[rows] if few is not ALL else slice(None)
@@ -157,7 +157,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """The yield surface for ordered stresses: 1 + sin phi, 1 - sin phi, 2 c cos phi and T (n,)."""
+    """Yield surface for ordered principal stresses; p, q, k, T (n,): 1 + sin phi, 1 - sin phi, 2 c cos phi, T."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine
@@ -166,7 +166,7 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return the violation (n,), Pa, of the yield surface by stresses (n, 3)."""
+        """Return the largest value (n,), Pa, of the yield functions at stresses t (n, 3); > 0 outside the surface."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
@@ -196,7 +196,7 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses (n, 3), Pa, of the end with least violation, derivatives (n, 3, 3), and violation (n,)."""
+        """Return the final stresses of least violation (n, 3), Pa, derivatives (n, 3, 3) and violations (n,)."""
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:
@@ -209,12 +209,12 @@ class _Return:
         return stresses, slopes, violation[best, n]
 
     def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
-        """Return the violation (n,), Pa, by stresses, and by multipliers that must be >= 0."""
+        """Return the violation (n,), Pa, of yield functions and order at stresses t, and of multipliers >= 0."""
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses on a face or on the edge of two, their derivatives, and their violation."""
+        """Return the stresses on a face or an edge of two faces, their derivatives, and their violation."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops
@@ -226,23 +226,23 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses of a vertex, zero derivatives, and violation; conditions: give quantities >= 0 in flow."""
+        """Return stresses at a vertex, zero derivatives, and violation; conditions: function, result >= 0 in flow."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
         return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return quantities that are >= 0 for an ordered strain in the cone of the flows of all six faces."""
+        """Return quantities that are >= 0 if an ordered plastic strain x is in the cone of all six flow directions."""
         total, difference = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Return the same for the two faces at t_2 = t_3 and the cut-off of t_1."""
+        """Return quantities as in `_in_apex`, for the two faces at t_2 = t_3 and the cut-off of t_1."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Return the same for the two faces at t_1 = t_2 and the cut-off of both."""
+        """Return quantities as in `_in_apex`, for the two faces at t_1 = t_2 and the cut-offs of t_1 and t_2."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Laws of soil with an initial stress.
 
-A law is evaluated at F F_i.  F is relative to the seeded state, and F_i is an initial stretch at the points.  The soil
+A law is evaluated at F F_i.  F is relative to the seeded state, and F_i is an initial stretch at each point.  The soil
 responds as if loading had caused its initial stress.  Volumes, porosities and conductivities refer to the seeded state.
-F_i has three axes, also in plane strain.  Laws with the state `plastic`, C_p^-1, contain the initial strain in it.
+F_i is (3, 3), also in plane strain.  In laws with the state `plastic`, C_p^-1 contains the initial strain.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of point data with the seeded state, the reference for yield."""
+"""Suffix of the names of point data in the seeded state, which are the reference for yield."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material with a point field for the initial stress, at first zero.
+    """Return a material with a point field for the initial stress, which is zero until it is set.
 
-    knows_space: whether its law takes F (3, 3).
+    knows_space: whether the material's law accepts F (3, 3).
     """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)
@@ -53,7 +53,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return a function of a law evaluated at F F_i; stresses and energies are per seeded volume."""
+    """Return a function of a law, evaluated at F F_i; stresses and energies are per volume of the seeded state."""
     names = Skeleton.arguments_of(function)
 
     def of(**given):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Materials: constitutive laws of the skeleton in UFL, and constants of skeleton and pore fluid.
 
-Both the material point method and the finite element reference use them.  User-defined laws derive from `Skeleton`.
+The material point method and the finite element reference use the same laws.  User-defined laws derive from `Skeleton`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ DRIED = ("suction", "suction_at_start")
 LOCKING = 0.43
 """Poisson's ratio above which cells use the mean dilatation, at twice the cost of a step.
 
-Errors of the drained beam's tip at h = 0.015 m, without and with it: -0.02 and +0.22 % at nu = 0.3, -0.44 and +0.21 %
-at 0.45, -2.0 and +0.21 % at 0.49, -10.3 and -0.02 % at 0.499; at h = 0.06 m and 0.499: -56 and -0.4 %.
+Errors of the drained beam's tip deflection without and with mean dilatation, h = 0.015 m: -0.02 and +0.22 % (nu =
+0.3), -0.44 and +0.21 % (0.45), -2.0 and +0.21 % (0.49), -10.3 and -0.02 % (0.499).  h = 0.06 m: -56, -0.4 % (0.499).
 """
 
 SEPARATION = 1e-4
-"""Relative separation of equal eigenvalues, which keeps their derivatives finite.
+"""Relative difference added between equal eigenvalues, so that their derivatives are finite.
 
-Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 1.8e-09, twice by 7.2e-09, finer cells by 1.5e-02.
 """
 
 
@@ -63,63 +63,63 @@ class Skeleton:
     grain_bulk
         Bulk modulus of the grains K_s, Pa, > 0; infinite for incompressible grains.
     grain_density
-        Density of the grains, kg/m^3, >= 0; used with gravity only.
+        Density of the grains, kg/m^3, >= 0; used only with gravity.
     conductivity_law
-        Function that returns the conductivity k, m/s, as UFL, at the present deformation.  Its arguments may be
+        Function that returns the conductivity k, m/s, as UFL, for the present deformation.  Arguments may be
         conductivity (the field above), F, J = det F, porosity, porosity0, x (present position), and p (pore pressure of
         the cell at the start of the substep, Pa).
     retention
-        Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or an object with their
-        methods, see `retention`; keyword only.  None: pores stay saturated.
+        Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
+        see `retention`; keyword only.  None: pores stay saturated.
 
-    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Their arguments
-    may be F, the law's fields, properties and state.  F is (d, d), in axisymmetry (3, 3) with the circumferential
-    stretch last, see `axes`.  In plane strain F is (3, 3), with the stretch out of plane last, in two cases: if Q1
-    cells would lock, and for soil with an initial stress.  The law must accept this shape, else F stays (2, 2).
+    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  These may have
+    the arguments F, and fields, properties and state of the law.  F is (d, d), in axisymmetry (3, 3) with the
+    circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last, in two
+    cases: if Q1 cells would lock, and for soil with an initial stress.  If the law rejects this shape, F is (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
     kirchhoff
         Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy; the tangent is UFL's.
 
-    The history variables are the law's `state`, name -> initial value.  `update` (F, ...) -> {name: UFL} sets them at
-    the points after every converged step.  A state that is not finite cuts the step.
+    The history variables are the law's `state`, name -> initial value.  `update` (F, ...) -> {name: UFL} computes them
+    at the points after every converged step.  If a new value is not finite, the time step is reduced.
 
-    Stresses without a closed formula have local `unknowns`, name -> initial value of their iteration.  They are
-    arguments of `kirchhoff` and `update`.  Unknowns and their equations are of order one:
+    A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  They are
+    arguments of `kirchhoff` and `update`.  Unknowns and their equations should be of order one:
 
     residual
-        Takes the law's fields, state, unknowns and `trial`; returns name -> UFL of the unknown's shape.  Newton's
-        method makes it zero at each point.
+        Function of the law's fields, state, unknowns and `trial`.  It returns name -> UFL of the unknown's shape.
+        Newton's method solves residual = 0 at each point.
     solution
-        Alternative to residual, in numpy.  Takes arrays (n, ...) of the law's fields, state and `trial`; returns
-        name -> (unknown (n, ...), {name of a trial value: derivative with respect to it (n, ..., ...)}).  It suits
-        return mappings with many cases, and existing codes: stress and new state are then the unknowns.  A derivative
-        may be a function without arguments, called when a tangent is assembled.  A missing derivative is zero.
-        NaN or infinity means that there is no solution, and cuts the step.  A law whose `energy` is not stationary in
-        these unknowns takes many Newton steps, because second derivatives are missing.
+        Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
+        returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
+        name of the trial value.  It suits return mappings with many cases, and existing codes.  The unknowns are then
+        stress and new state.  A derivative may be a function without arguments, called when a tangent is assembled.  A
+        missing derivative is zero.  If there is no solution, values are NaN or infinite; the time step is then reduced.
+        If `energy` is not stationary in these unknowns, second derivatives are missing and Newton's method is slow.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
-        take F itself.  Values other than UFL are passed to `kirchhoff` and `update` only, as `trial`.
+        have F itself as argument.  Values other than UFL are passed to `kirchhoff` and `update` only, in `trial`.
 
-    All these functions may take `dt`, the time since the start of the step, s, for rate-dependent laws.  The state at
-    the end of a step must return the stress of the step at dt = 0.  They may take `cell_size`, the mean length of a
-    cell, m, which makes softening independent of the grid.
+    All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
+    The new state must give the stress at the end of the step again if it is evaluated with dt = 0.  They may have the
+    argument `cell_size`, the mean edge of a cell, m, which makes softening independent of the grid.
 
     A law that depends on suction has `suction`: 0.0 in its state, and may have `suction_at_start`: 0.0.  The scene sets
-    both to max(-p, 0), Pa: at the end of a substep, and at seeding.  For local unknowns suction is a `trial` value.
+    these to max(-p, 0), Pa, at the end of a substep and at seeding.  For local unknowns suction is a `trial` value.
 
-    For every law bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
+    For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 
     Raises
     ------
     ValueError
-        A constant out of its range.  The scene raises it for fields out of range, names or shapes that disagree, and
-        functions that raise or do not return UFL of the required shape.
+        A constant is out of its range.  The scene raises it for fields out of range, conflicting names or shapes, and
+        functions that raise errors or do not return UFL of the required shape.
 
     Examples
     --------
-    A user-defined law is a frozen dataclass (the README has one with a fibre)::
+    A user-defined law is a frozen dataclass (the README shows a law with fibres)::
 
         @dataclass(frozen=True)
         class Stiffening(mpm.NeoHookean):
@@ -152,12 +152,12 @@ class Skeleton:
     elastic_hencky: ClassVar[bool] = False
     """Whether stresses follow from elastic strains by Hencky's law; they then determine the elastic energy."""
     linear: ClassVar[bool] = False
-    """Whether the stress is linear in F; one factorisation is then valid until the active cells change."""
+    """Whether the stress is linear in F; a factorisation is then reused until active cells or step size change."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
-    """Names of `BY_SCENE` that the law's functions take."""
+    """Names in `BY_SCENE` that are arguments of the law's functions."""
     parameters: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields and properties that the law's functions take."""
+    """Names of fields and properties that are arguments of the law's functions."""
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -191,7 +191,7 @@ class Skeleton:
         drains = getattr(self.conductivity_law, "specific_yield", 0.0)
         if drains and self.retention is not None:
             raise ValueError(
-                f"{type(self).__name__}: retention beside a specific yield {drains:g}, must be one of them"
+                f"{type(self).__name__}: retention and a specific yield {drains:g}, must be only one of them"
             )
         _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):
@@ -199,7 +199,7 @@ class Skeleton:
             _check(self, "biot", lambda v: (self.porosity <= v) & (v <= 1), f"in [porosity{n}, 1]")
 
     def at(self, X: NDArray[np.float64]) -> Skeleton:
-        """Return this material with its fields evaluated at reference positions X (n, d), m: arrays (n, ...)."""
+        """Return this material with its fields evaluated at reference positions X (n, d), m, as arrays (n, ...)."""
         values, scalars = {}, [f.name for f in fields(Skeleton)]
         for name in constants_of(self):
             value, what = getattr(self, name), f"{type(self).__name__}: {name}"
@@ -246,12 +246,12 @@ class Skeleton:
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress, `shape` or (3, 3), Pa, as UFL; local unknowns may be its only link to F."""
+        """Return the Kirchhoff stress, `shape` or (3, 3), Pa, as UFL; it depends on F, or on local unknowns."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
     def out_of_plane(cls, F, values: Mapping[str, object]):
-        """Return the effective Cauchy stress out of plane in plane strain, Pa, as UFL; None if the law has none.
+        """Return the out-of-plane effective Cauchy stress in plane strain, Pa, as UFL; None if the law has none.
 
         Parameters
         ----------
@@ -263,7 +263,7 @@ class Skeleton:
         if cls.kirchhoff is not None:
             tau = cls._kirchhoff(F, values, (2, 2))
             return tau[2, 2] / ufl.det(F) if tau.ufl_shape == (3, 3) else None
-        if cls.unknowns:  # their derivative by a stretch out of plane is not available
+        if cls.unknowns:  # their derivative with respect to an out-of-plane stretch is not available
             return None
         whole = ufl.variable(ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]]))
         try:
@@ -283,7 +283,7 @@ class Skeleton:
 
     @property
     def nearly_incompressible(self) -> bool:
-        """Whether Q1 cells would lock, so that the law needs the mean dilatation of each cell (`dilatation`)."""
+        """Whether Q1 cells would lock; they then use the mean dilatation of each cell (`dilatation`)."""
         return self.poisson > LOCKING
 
     @property
@@ -292,12 +292,12 @@ class Skeleton:
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return tau, 1/Pa: a quarter of the jump stabilisation of 2 x 2 cells, half of it for laws with a state.
+        """Return tau, 1/Pa: a quarter of the jump stabilisation of 2 x 2 cells, or half of it for laws with a state.
 
-        The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter is better conditioned and smears less (Silvester and
-        Kechkar 1990; Camargo, White and Borja 2021).  The value of 2 x 2 x 2 cells is up to 0.44 smaller.  In 3D this
-        is too little for pressures that alternate along two axes only, as in plane strain.  The damping acts on
-        increments of a step, so an oscillation from the onset of yield remains.
+        The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
+        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is smaller by a factor of up to
+        0.44.  In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards
+        in plane strain.  The damping acts on the increment of a step: an oscillation from the onset of yield remains.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -320,7 +320,7 @@ def check_given(obj, allowed: Mapping[str, str]) -> None:
 
 
 def _check(obj, name: str, test: Callable, allowed: str) -> None:
-    """Raise ValueError for a constant, or the first value of an array, that fails a test; skip functions of place."""
+    """Raise ValueError for a constant, or the first value of an array, that fails a test; functions are not tested."""
     value = getattr(obj, name)
     if callable(value):
         return
@@ -335,11 +335,11 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
 
 @dataclass(frozen=True)
 class Hencky(Skeleton):
-    """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, lambda_i the principal stretches.
+    """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
-    Plane strain in 2D.  Source: Hencky (1928).  A small constant under the root keeps the derivatives of equal
-    eigenvalues of C = F^T F finite.  It is in the deviatoric part only, whose derivative vanishes there, so the stress
-    at rest is exactly zero.  Parameters as for `Skeleton`.
+    Plane strain in 2D.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
+    eigenvalues of C = F^T F finite.  Only the deviatoric part contains it, with zero derivative at F = I.  The stress
+    at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
     """
 
     @staticmethod
@@ -358,7 +358,7 @@ class Hencky(Skeleton):
 
 
 def _deviatoric(F):
-    """Return sum l_i^2 - (sum l_i)^2 / 3 of the logarithmic stretches l_i of an axisymmetric F, as UFL."""
+    """Return sum l_i^2 - (sum l_i)^2 / 3 of the logarithmic stretches l_i of F, with axis 3 principal, as UFL."""
     whole = F.T * F
     C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
     return _stretch_difference(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
@@ -367,8 +367,8 @@ def _deviatoric(F):
 def _stretch_difference(C):
     """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
-    The eigenvalues over their mean are 1 + radius and 1 - radius.  This has one quotient; second derivatives of
-    C / mean would take twice as many divisions.
+    The eigenvalues divided by their mean are 1 + radius and 1 - radius.  This formula has one quotient; second
+    derivatives of C / mean would have twice as many.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
@@ -376,7 +376,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; `separation` separates equal eigenvalues."""
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; separation: least distance of two eigenvalues."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
@@ -445,19 +445,18 @@ class unsaturated:
     """Conductivity law for flow below a free surface; use it as `conductivity_law` of a material.
 
     The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
-    Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The weight counts
-    all pores as full.  The pressure is taken at the start of each substep.  Steady flow therefore needs steps of some
-    (cell size)^2 / (coefficient of consolidation), and a free surface must pass less than a cell in a step.
+    Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
+    is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
+    steps of about (cell size)^2 / (coefficient of consolidation), in which a free surface crosses less than a cell.
 
     Parameters
     ----------
     suction
-        Suction, Pa, > 0: 0.5 to 1 times the unit weight of water times the height of a cell.
+        Suction, Pa, > 0: 0.5 to 1 times the unit weight of water times the cell height.
     least
-        Relative conductivity of drained soil, in (0, 1).
+        Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  With 0 a free surface falls at once, and the law is one of
-        steady flow.
+        Drainable porosity, in [0, 1), at most the porosity.  If it is 0, a free surface falls at once: for steady flow.
     """
 
     suction: float
@@ -487,13 +486,13 @@ class Fluid:
         Density rho_w at zero pressure, kg/m^3, > 0, used for the weight; the flowing mass has rho_w exp(p / K_w).
     gravity
         Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default the scene's gravity if it is a
-        constant vector other than zero, else 9.81.  With units other than m and s it must be given in scenes without
-        gravity or with gravity as a function of time.
+        constant vector other than zero, else 9.81.  With units other than m and s, scenes without gravity, or with
+        gravity as a function of time, require it.
 
     Raises
     ------
     ValueError
-        A constant out of its range.
+        A constant is out of its range.
     """
 
     bulk: float = 2.2e9

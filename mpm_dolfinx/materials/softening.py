@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Drucker and Prager's law with loss of cohesion by slip, and a viscosity.
+"""Drucker and Prager's law with cohesion that decreases with slip, and a viscosity.
 
-Softening localises in shear bands one cell wide.  With softening by strain the dissipated work would decrease with the
-cell size.  The cohesion therefore falls with the slip of a band, gamma h, for a plastic shear strain gamma and cell
-size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
+Softening localises in shear bands one cell wide.  If the cohesion depended on strain, the dissipated work would
+decrease with the cell size.  The cohesion therefore depends on the slip gamma h of a band, with the plastic shear
+strain gamma and the cell size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
 
     c = c_0 - (c_0 - c_r) min(1, gamma h / s),
 
 and softening along a band dissipates (c_0 - c_r) s / 2 on any grid.  The viscosity is Perzyna's, f = eta dgamma/dt,
-linear and implicit; it vanishes for slow loading.
+with the yield function f.  It is linear and integrated implicitly, and has no effect in slow loading.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ class SofteningDruckerPrager(DruckerPrager):
     residual
         Residual cohesion c_r, Pa, in [0, cohesion]; if it equals the cohesion, there is no softening.
     slip
-        Slip s along a shear band, m, > 0, at which the cohesion is c_r.  Cells so large that soil would soften faster
-        than it unloads are refused.
+        Slip s along a shear band, m, > 0, at which the cohesion is c_r.  ValueError if the cells are so large that
+        the soil would soften faster than it unloads.
     viscosity
-        eta, Pa s, >= 0: sqrt(J_2) + eta_phi p - xi c = eta dgamma/dt.
+        Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
     Other parameters: see `DruckerPrager`, without hardening.  The state is `plastic` and `hardened`, xi times the
-    plastic shear strain.  Soil torn apart at the apex of the cone has the residual cohesion.
+    plastic shear strain.  Soil in tension at the apex of the cone has the residual cohesion.
 
     Raises
     ------
     ValueError
-        A constant out of its range, or missing.
+        A constant is out of its range or missing.
     """
 
     residual: Field = None
@@ -94,12 +94,12 @@ class SofteningDruckerPrager(DruckerPrager):
 
 
 def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, residual, strain, drag) -> dict:
-    """Return the stress like `drucker_prager.returned`; strain: plastic shear strain at the residual cohesion."""
+    """Return the stress as in `drucker_prager.returned`; strain: plastic shear strain at which the cohesion is c_r."""
     end = xi * strain  # in terms of `hardened`
     moduli = trial, bulk, shear, eta, xi, eta_flow
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)
     left = returned(*moduli, residual, 0.0, hardened, drag)
-    # soil at the apex is torn apart: it has the residual cohesion
+    # soil in tension at the apex has the residual cohesion
     grown = hardened + falling["hardened"]
     softens = ufl.le(ufl.conditional(ufl.gt(falling["apex"], 0.5), 2 * end, grown), end)
     out = {name: ufl.conditional(softens, falling[name], left[name]) for name in ("p", "ratio", "hardened")}

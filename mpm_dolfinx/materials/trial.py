@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Trial elastic strain of multiplicative plasticity, and isotropic functions, in UFL and in numpy.
 
-In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
+In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
 smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because the nodes are kept separate.
 Principal values that depend on all three eigenvalues, with kinks, have exact derivatives in numpy, see `Coaxial`.
 """
@@ -23,7 +23,7 @@ PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1)
 
 
 class Isotropic:
-    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether its third axis is principal."""
+    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether the third axis of b is principal."""
 
     def __init__(self, b, plane: bool):
         self._b, self._plane = b, plane
@@ -47,7 +47,7 @@ class Isotropic:
 
 
 class Trial:
-    """The trial elastic strain of a deformation gradient, in UFL.
+    """Trial elastic strain for a deformation gradient, in UFL.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Trial:
 
 
 def components(b, plane: bool):
-    """Return the components of a symmetric UFL tensor (3, 3) as a vector: all, or `PLANE`."""
+    """Return the components of a symmetric UFL tensor (3, 3) as a vector: six, or the four in `PLANE`."""
     return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
 
 
@@ -83,13 +83,13 @@ def symmetric(values):
 
 
 def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return eigenvalues (n, 3) and axes (n, 3, 3), a column each, of tensors with components b (n, 4 or 6)."""
+    """Return eigenvalues (n, 3) and axes (n, 3, 3), as columns, of tensors with components b (n, 4) or (n, 6)."""
     n = len(b)
     if b.shape[1] == len(SPACE):
         full = np.empty((n, 3, 3))
         for k, (i, j) in enumerate(SPACE):
             full[:, i, j] = full[:, j, i] = b[:, k]
-        invalid = ~np.isfinite(b).all(axis=1)  # of a diverging iterate
+        invalid = ~np.isfinite(b).all(axis=1)  # in a diverging iterate
         full[invalid] = np.eye(3)
         x, axes = np.linalg.eigh(full)
         return np.where(invalid[:, None], np.nan, x), axes
@@ -114,7 +114,7 @@ class Coaxial:
     y : (n, 3)
         Principal values of the coaxial tensors.
     plane
-        Whether tensors have the components `PLANE`, for plane strain and axisymmetry.
+        Whether tensors have the components in `PLANE`, for plane strain and axisymmetry.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -132,7 +132,7 @@ class Coaxial:
     @property
     def values(self) -> NDArray[np.float64]:
         """Components (n, 6)."""
-        out = np.zeros((len(self._x), len(SPACE)))  # in the plane the rest is zero
+        out = np.zeros((len(self._x), len(SPACE)))  # in the plane the other components are zero
         out[:, : len(self._inner)] = (self._outer @ self._y[:, :, None])[:, :, 0]
         return out
 

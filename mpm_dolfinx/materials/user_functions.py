@@ -1,33 +1,33 @@
 # SPDX-License-Identifier: MIT
 """User-defined functions that return UFL.
 
-Their arguments are chosen by name.  Laws and conductivities belong to materials: see `skeleton.Skeleton`.  Terms of the
-balances are given to `Simulation`, and integrated over the configuration at the start of the step.  Arguments:
+The name of an argument determines its value.  Laws and conductivities belong to materials: see `skeleton.Skeleton`.
+`Simulation` takes terms of the balances, integrated over the configuration at the start of the step.  Arguments:
 
 points
-    Quadrature points.  `points.dx`: their measure; `points.value(f)`, `points.grad(f)`: f and its gradient, f one of
-    u and v, in axisymmetry (3, 3) with f_r / r; `points.F`: deformation gradient at the start of the step, of the same
-    shape, with the volume ratio as determinant; `points.position`, `points.displacement`: position, and displacement
-    since the start (or its last reset), both at the start of the step.  Data of the material points: fields of the
-    materials that are functions of position, and the laws' state.
+    Quadrature points.  `points.dx` is their measure.  `points.value(f)` and `points.grad(f)` are the value and gradient
+    of f = u or v; the gradient is (3, 3) in axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the
+    start of the step, of the same shape, with the volume ratio as determinant.  `points.position` and
+    `points.displacement` are position and displacement at the start of the step, since the start of the run or the last
+    reset.  Other names: fields of materials that are functions of position, and the laws' state.
 t
-    Time of the balances, s, a UFL constant: the end of the step or of its first substep.
+    Time at which the balances hold, s, a UFL constant: the end of the step or of its first substep.
 
-A function in `terms` adds to the balance of momentum, int P : grad v dV - loads + term = 0:
+A function in `terms` is added to the balance of momentum, int P : grad v dV - loads + term = 0:
 
 u
     Increment of the displacement in the step, m; Q1.
 v
     Test function.  The term is a linear form in v, such as -inner(b, points.value(v)) * points.dx for a body force b.
-    Without v it is a stored energy, and its derivative is added.
+    A term without v is a stored energy; its derivative with respect to u is added.
 velocity
-    Velocity, m/s, of the order of the time integration, for viscous resistance.
+    Velocity, m/s, from the scheme of time integration, for viscous resistance.
 dt
     Time since the start of the step, s, a UFL constant; u / dt is the mean velocity.
 
-The tangent of a term in v and u is assumed unsymmetric.
+The tangent of a term with v is assumed to be unsymmetric.
 
-The function of a `Source` returns the inflow as a volume of fluid at zero pressure in a time, m^d/s:
+The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s:
 
 q
     Test function, constant in the cells: the source is s * q * points.dx with s in 1/s.
@@ -52,7 +52,7 @@ from mpm_dolfinx.base.validation import asked, instance, line, line_of
 
 
 def call(function: Callable, kind: str = "UFL", /, **available):
-    """Call a user-defined function with the arguments in its signature; kind: type of its result, for messages.
+    """Call a user-defined function with the arguments in its signature; kind: type of the result, for messages.
 
     Raises
     ------
@@ -68,12 +68,12 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 
 
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
-    """Return the UFL expression of a user-defined function, with one of the given shapes.
+    """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
     Raises
     ------
     ValueError
-        As `call`; or the result is no UFL, has another shape, or does not depend on the argument `of`.
+        As in `call`; or the result is no UFL, has another shape, or does not depend on the argument `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
@@ -82,17 +82,17 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
         apply_algebra_lowering(out)  # here UFL detects most errors
     except Exception as error:  # UFL has several kinds
         why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
-        raise ValueError(f"{_name(function)}: gives {line(value)}{why}, must be {allowed}") from error
+        raise ValueError(f"{_name(function)}: returns {line(value)}{why}, must be {allowed}") from error
     if out.ufl_shape not in shapes:
-        raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
+        raise ValueError(f"{_name(function)}: returns shape {out.ufl_shape}, must be {allowed}")
     if of and not any(part is available[of] for part in unique_pre_traversal(out)):
-        raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
+        raise ValueError(f"{_name(function)}: returns {line_of(out)}, must be {allowed}")
     _check_parts(_name(function), out)
     return out
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Raise ValueError for numbers that do not compile, and for sums over an index of two sizes, valid in new UFL."""
+    """Raise ValueError for infinite numbers and NaN, and for sums over an index of two sizes, which new UFL accepts."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")
@@ -101,16 +101,16 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
             for factor in part.ufl_operands:
                 for index, size in zip(factor.ufl_free_indices, factor.ufl_index_dimensions, strict=True):
                     if sizes.setdefault(index, size) != size:
-                        raise ValueError(f"{what}: sums over {sizes[index]} and {size} components, must be as many")
+                        raise ValueError(f"{what}: index of sizes {sizes[index]} and {size}, must be of one size")
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return a user-defined function's dict as UFL with the given shapes; some: whether names may be missing.
+    """Return the dict of a user-defined function as UFL with the given shapes; some: whether names may be missing.
 
     Raises
     ------
     ValueError
-        The result is no dict of UFL with these names and shapes, or is constant.
+            The result is no dict of UFL with these names and shapes, or all values are constant.
     """
     instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
@@ -122,9 +122,9 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
         _check_parts(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
     if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
-        raise ValueError(f"{what}: gives {found}, must have {allowed}")
+        raise ValueError(f"{what}: returns {found}, must have {allowed}")
     if not any(extract_coefficients(value) for value in out.values()):
-        raise ValueError(f"{what}: gives numbers alone, must be UFL that depends on its arguments")
+        raise ValueError(f"{what}: returns only numbers, must be UFL that depends on its arguments")
     return out
 
 
@@ -134,15 +134,15 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
     Raises
     ------
     ValueError
-        As `call`; or the result is no form, or has integrals over the grid.
+        As in `call`; or the result is no form, or has integrals over the grid.
     """
     out, dx = call(function, **available), available["points"].dx
     allowed = "a form with points.dx"
     if not isinstance(out, ufl.Form):
-        raise ValueError(f"{kind}: {_name(function)} gives {line(out)}, must be {allowed}")
+        raise ValueError(f"{kind}: {_name(function)} returns {line(out)}, must be {allowed}")
     for integral in out.integrals():
         if (integral.integral_type(), integral.subdomain_id()) != (dx.integral_type(), dx.subdomain_id()):
-            raise ValueError(f"{kind}: {_name(function)} gives an integral over the grid, must be {allowed}")
+            raise ValueError(f"{kind}: {_name(function)} returns an integral over the grid, must be {allowed}")
         _check_parts(f"{kind}: {_name(function)}", integral.integrand())
     return out
 
@@ -153,7 +153,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
     Raises
     ------
     ValueError
-        As `form`; or the term depends on neither the unknown nor v.
+        As in `form`; or the term depends on neither the unknown nor v.
     """
     out = form("terms", term, **available)
     if out.arguments():
@@ -169,14 +169,14 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
-        if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # an OSError: the compiler is at fault
+        if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # OSError: a fault of the C compiler
             raise
         why = f"{type(error).__name__}: {line_of(error)}"
         raise ValueError(f"{what}: does not compile ({why}), must be {allowed}") from error
 
 
 def _is_ours(error: Exception) -> bool:
-    """Whether this package raised an error; its message then names the object."""
+    """Return whether this package raised an error; its message then names the object."""
     frames = error.__traceback__
     while frames.tb_next is not None:
         frames = frames.tb_next

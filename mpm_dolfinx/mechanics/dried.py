@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Derivatives of nodal forces with respect to the cells' pressures, through laws that depend on suction.
 
-The stress of such a law depends on the pressure in addition to the term chi p of Bishop's stress.  So does the mean
-stress pi of cells with mean dilatation.
+The stress of such a law depends on the pressure in addition to the term chi p of Bishop's stress. The mean stress pi of
+cells with mean dilatation depends on the pressure too.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 class OfSuction:
-    """Derivatives of the laws' forces with respect to the cells' pressures.
+    """Derivatives of the nodal forces with respect to the cells' pressures, for laws that depend on suction.
 
     Parameters
     ----------
     grid
         Background grid.
     dilatation
-        Mean dilatation of cells, if any lock.
+        Mean dilatation of cells, None if no cell would lock.
     """
 
     def __init__(self, grid: Grid, dilatation: MeanDilatation | None):
@@ -37,17 +37,17 @@ class OfSuction:
         self._locked: dict[int, CellSums] = {}
 
     def add(self, number: int, points: FormPoints, F, slopes: Sequence, locks: bool) -> None:
-        """Add a part of the pieces.
+        """Add the pieces of one part, see `SceneMaterials.parts`.
 
         Parameters
         ----------
         number, points, locks
-            Number of the part, its pieces, and whether their laws take the mean dilatation.
+            Index of the part; integration points of its pieces; whether its law uses the mean dilatation.
         F
             Deformation gradient (d, d), a UFL variable.
         slopes
-            UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d) and, with mean
-            dilatation, of its derivative with respect to theta.  Empty without suction.
+            UFL derivatives with respect to the pressure, Pa: of the first Piola-Kirchhoff stress (d, d) and, with mean
+            dilatation, of the stress pi conjugate to theta.  Empty if the law is independent of suction.
         """
         share = 1 / ufl.det(points.F)
         tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -58,7 +58,7 @@ class OfSuction:
             (self._locked if locks else self._free)[number] = CellSums([*along, *scalars], points)
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return cells (c,), and derivatives (c, n), m^(d-1), of nodal forces with respect to their pressures."""
+        """Return cells (c,), and the derivatives (c, n), m^(d-1), of nodal forces with respect to their pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1
@@ -70,5 +70,5 @@ class OfSuction:
 
 
 def _padded(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return rows of this width, the rest zero."""
+    """Return rows of the given width, filled up with zeros."""
     return np.pad(values, ((0, 0), (0, width - values.shape[1])))

@@ -2,17 +2,17 @@
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
 The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment of the step. Nearly empty cells then
-affect neither the conditioning nor the accuracy. The penalty is a viscosity of the step, so it must not act on
-load-bearing cells:
+affect neither the conditioning nor the accuracy. The penalty resists each step's increment like a viscosity, so it must
+not act on load-bearing cells:
 
-* The strength s of a face falls from 1 to 0 as the filling of the emptier over the fuller cell rises to RATIO. A second
-  factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell). Empty cells thus
-  follow full ones at almost no work. A penalty between equally filled cells would resist kinks of the body itself.
+* The strength s of a face falls from 1 to 0 as the ratio of the emptier to the fuller cell's filling rises to RATIO. A
+  second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell). Empty cells
+  thus follow full ones at almost no work. Between equally filled cells a penalty would resist kinks of the body itself.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
-  stretch of the full neighbour, against their own volume constraint. In flowing soil even 2G does: see `stiffness`.
+  stretch of the full neighbour, against their own volume constraint. In flowing soil even 2G is reduced: `stiffness`.
 
-With integration at the points, any cell may hold too few points for its nodes. There all faces of cells that are not
-full carry a fifth of the penalty.
+With integration at the material points, any cell may hold too few points for its nodes. Then all faces of cells that
+are not full have a penalty of strength 0.2.
 """
 
 from __future__ import annotations
@@ -31,31 +31,34 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty. Plateau (beam): halved 9.9e-06, doubled 1.9e-05, cells 1.5e-02 (relative changes)."""
-YIELDING = 0.02
-"""Smallest factor of the penalty for nearly incompressible laws with a state."""
-RATIO = 0.3
-"""A cell with a smaller filling, relative to a neighbour, is nearly empty: the face between them is penalised.
+"""Strength of the ghost penalty.
 
-Plateau (soil): halved 1.3e-03, doubled 5.9e-04, cells 3.0e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 9.9e-06, twice by 1.9e-05, finer cells by 1.5e-02.
+"""
+YIELDING = 0.02
+"""Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
+RATIO = 0.3
+"""Ratio of the volume fractions of two neighbouring cells below which their common face is penalised.
+
+Sensitivity (soil scene): half the value changes the result by 1.3e-03, twice by 5.9e-04, finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Strength for integration at the points; volume fraction below which a cell's faces then carry the penalty."""
+"""Strength of the penalty with integration at the points; volume fraction below which faces of a cell have it."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
     """Return the modulus that scales the penalty, Pa: 2G, reduced for nearly incompressible laws with a state.
 
-    In nearly empty cells of flowing soil the volume constraint opposes the penalty. With 2G, a tenfold penalty raises a
-    footing's limit load by 0.3 % (nu = 0.49) and 0.75 % (0.499), by 0.004 % at nu = 0.3. At low nu it is not reduced:
-    without it Newton's method fails in frictional soil at deep penetration.
+    In nearly empty cells of flowing soil the volume constraint opposes the penalty. With 2G, ten times the penalty
+    raises a footing's limit load by 0.004 % at nu = 0.3, by 0.3 % at 0.49 and by 0.75 % at 0.499. At low nu the penalty
+    is not reduced: a smaller one makes Newton's method fail in frictional soil at deep penetration.
     """
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
 
 
 def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
-    """Return the form int strength h^power [d_n u].[d_n v] dS over faces; h: mean cell size across them, m."""
+    """Return the form int strength h^power [d_n u].[d_n v] dS over faces; h: mean cell size normal to the face, m."""
     n = ufl.FacetNormal(grid.mesh)("+")
     *_, across = across_faces(grid, n)
     dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
@@ -64,7 +67,7 @@ def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power:
 
 
 class GhostPenalty:
-    """The penalty's form, with modulus and volume fraction of the cells as coefficients.
+    """Form of the ghost penalty, with modulus and volume fraction of the cells as coefficients.
 
     Parameters
     ----------
@@ -73,7 +76,7 @@ class GhostPenalty:
     V
         Space of the displacement.
     at_points
-        Whether bodies are integrated at their points.
+        Whether bodies are integrated at their material points.
 
     Attributes
     ----------
@@ -82,7 +85,7 @@ class GhostPenalty:
     shear
         Shear modulus, Pa, of laws with a state: mean over the material in the cell; zero for other laws.
     firmness
-        Form of the elastic shear stiffness over whole cells, times their volume fraction: regularises tangents.
+        Form of the elastic shear stiffness of whole cells, times their volume fraction; it regularises tangents.
     fill, beside
         Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """
@@ -113,9 +116,10 @@ class GhostPenalty:
     def set_contents(
         self, own: NDArray[np.int64], volume: NDArray[np.float64], *moduli: NDArray[np.float64]
     ) -> NDArray[np.int64]:
-        """Set the contents of the owned cells (n,) that are not empty; return all active local cells, ascending.
+        """Set the volume fractions and moduli of the owned cells (n,) that contain material.
 
-        Volumes (n,), m^d; moduli (n,): `modulus` and `shear`, Pa, times volume. `fill` must be zero before.
+        Return all active local cells, ascending; volume (n,), m^d; moduli (n,): `modulus` and `shear` times volume.
+        `fill` must be zero before the call.
         """
         grid, fill = self.grid, self.fill.x.array
         fill[own] = volume / grid.volumes(own)
@@ -130,17 +134,17 @@ class GhostPenalty:
         return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
-        """Return the penalty on faces of this process; at_walls: faces of cells with nodes on fixed walls."""
+        """Return the penalty on faces of this process; at_walls: faces of cells with nodes on walls of the grid."""
         return GhostLoads(self.form.on(facets), self.form.on(at_walls))
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the inner faces that carry the penalty."""
+        """Return the inner faces that have a penalty."""
         fill = self.fill.x.array[self.grid.facet_cells[facets]]
         return facets[fill.min(axis=1) < (FULL if self._at_points else RATIO * fill.max(axis=1))]
 
 
 class GhostLoads(Loads):
-    """The ghost penalty on all inner faces of partly filled cells, and its part on cells at walls of the grid."""
+    """Ghost penalty on all inner faces of partly filled cells, and its part on cells at walls of the grid."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides: penalties on the mean in each cell, and weakly at points; see `held_cells`.
+"""Prescribed displacements of sides: penalties on the mean in each cell and, weaker, at points; see `held_cells`.
 
-A side that lacks a part of its way gets multipliers, one for each cell and component, by the method of multipliers
-(Hestenes 1969).  They make the means exact, whatever resists.
+If a side lags behind its prescribed displacement, each cell and component gets a multiplier, by the method of
+multipliers (Hestenes 1969).  With multipliers the means are exact against any resistance of the body.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from mpm_dolfinx.points.parts import Parts
 
 
 class HoldForms:
-    """Penalty forms: stiffness, and force towards the prescribed value, at points or for means over points."""
+    """Forms of the penalty: stiffness, and force towards the prescribed displacement, at points or for their means."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -48,11 +48,11 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the mean of a Q1 field along the direction, from the moments of its points."""
+            """Return the component of a Q1 field along `direction`, averaged over points with the given moments."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
-            if d == 3:  # a trilinear function has one third derivative that is not zero
+            if d == 3:  # the only third derivative of a trilinear function that is not zero
                 mean += ufl.grad(second)[:, 0, 1, 2] * h.product
             return ufl.dot(mean, h.direction)
 
@@ -66,7 +66,7 @@ class GivenDisplacements(Acting):
     Parameters
     ----------
     setting, displacements
-        The stage, and its conditions by name.
+        The stage, and its conditions of this kind by name.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class GivenDisplacements(Acting):
         return [faces for _, faces, _ in self._holds]
 
     def placed(self, place: Place) -> Loads:
-        """Return the penalties of a substep, one row for each component and each cell or point."""
+        """Return the penalties in a substep: one for each component and each cell or point."""
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
         ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty: zero displacement
@@ -113,7 +113,7 @@ class GivenDisplacements(Acting):
             if wrong >= 0:
                 hold, x = self._holds[held.number[wrong]][0], held.x[wrong] + self._grid.base
                 what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
-                message = f"{what}, where a wall of the grid fixes it; must be 0 there, or the wall must leave it free"
+                message = f"{what}, which a wall of the grid fixes there; must be 0 there, or free at the wall"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
@@ -126,19 +126,19 @@ class GivenDisplacements(Acting):
     def _held_points(
         self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
     ) -> HeldPoints:
-        """Return the integration points on the sides, at the owners of their cells.
+        """Return the integration points on the sides, on the processes that own their cells.
 
-        ends: start and end of the step, s, empty for sides at rest; inertia: whether velocities count.
+        ends: start and end of the step, s, empty for zero displacement; inertia: whether bodies have inertia.
         """
         d, rows = self._grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self._holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
-        cut_points = cut.points if ends else points  # in the positions of the cut
+        cut_points = cut.points if ends else points  # at the positions of the cut domains
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
         modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
         firm = self._materials.confined_modulus(before)
-        # from the last reset of the grid, like the stiffnesses: constant while the cut is valid
+        # values at the last reset of the grid, like the stiffnesses: constant until the next reset
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
@@ -157,19 +157,19 @@ class GivenDisplacements(Acting):
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
     def _check_meeting(self, t: float) -> None:
-        """Refuse prescribed displacements that differ where two sides meet: the stress there would be infinite."""
+        """Raise ValueError if prescribed displacements differ where two sides meet: the stress would be infinite."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
             if jump.max(initial=0.0) > NEAR * self._grid.least:
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
-                raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or be two cells apart")
+                raise ValueError(f"{what}, at {X[jump.argmax()]}; must be equal there, or the sides two cells apart")
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
         return everywhere(self._grid, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return reactions with all components equal to `value`."""
+        """Return reactions with every component equal to `value`."""
         return {"reactions": {name: np.full(self._grid.dim, value) for name in self._names}}
 
     def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
@@ -185,7 +185,7 @@ class GivenDisplacements(Acting):
     def _warn(
         self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
     ) -> None:
-        """Warn, once for each condition, of forces that no stress increment of the body can balance."""
+        """Warn, once for each condition, if a reaction exceeds any stress increment that the body can bear."""
         for number, x in held.beyond(row, axis, force, self._warned):
             why = "its reaction is an artefact; is it also held by another condition, or is the step too large?"
             what = "%s: not at its prescribed position at %s: %s"
@@ -193,7 +193,7 @@ class GivenDisplacements(Acting):
             self._warned.add(number)
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse a step in which no point of a side follows more than half of its prescribed increment."""
+        """Raise NotConverged if all points of a side follow less than half of their prescribed increment."""
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
@@ -209,19 +209,19 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of particle domains: prisms of volume (m,) behind their prescribed faces.
+        """Return new corners (m, 2^d, d), m, of the particle domains `ids`; domains at a held side become prisms.
 
-        In axisymmetry the volume is the area in the plane. The face keeps its tracked corners: the penalty would pull a
-        displaced face back at once.
+        tracked: corners, m; volume (m,): volumes, in axisymmetry areas in the plane.  A prism has the given volume, and
+        the tracked corners on the held face: if the face moved, the penalty would pull it back at once.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
             held = np.flatnonzero(np.isin(ids, faces.id))
-            number = faces.face[np.searchsorted(faces.id, ids[held])]  # the first of two prescribed faces
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # the first of a domain's two held faces
             axis, end = (k[:, None] for k in np.divmod(number, 2))
             outward = face_vectors(tracked[held], number)
             depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
-            face = index ^ ((index >> axis & 1 ^ end) << axis)  # of each corner: that on the face
+            face = index ^ ((index >> axis & 1 ^ end) << axis)  # for each corner, the corner opposite on the held face
             there = np.take_along_axis(tracked[held], face[:, :, None], axis=1)
             corners[held] = there - np.where((face != index)[:, :, None], depth[:, None], 0.0)
         return corners
@@ -233,17 +233,17 @@ class HoldLoads(Loads):
     Parameters
     ----------
     acting
-        The conditions.
+        The prescribed displacements of the stage.
     forms, data
-        Forms, and the prescribed components with stiffness, direction and gap.
+        Forms, and their points: one for each prescribed component, with stiffness, direction and gap.
     held
-        Geometry and stiffness of all rows.
+        Geometry and stiffness of all penalties.
     row : (m,)
-        Row in `held` of each component.
+        Index in `held` of each prescribed component.
     share : (m, 2^d)
-        Fraction of each component's force on each node, without the part carried by grid boundary conditions.
+        Fraction of each component's force on each node, without the fraction that walls of the grid bear.
     place
-        Time and cut of the substep.
+        Time and cut domains of the substep.
     """
 
     stiff = True
@@ -268,14 +268,14 @@ class HoldLoads(Loads):
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
-        self._asked = data["gap"][:, 0]  # of means, whose gaps have no other part at first
+        self._asked = data["gap"][:, 0]  # of means: their gaps contain nothing else at first
         self._lacked = np.full(len(acting.held) * self._d, np.inf)
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces of cell means to their multipliers, on sides that lack a part of their way.
+        """Add the penalty forces of cell means to their multipliers, on sides that lag behind their displacement.
 
-        Such a body, for example sealed water, resists the side's motion more stiffly than one of its cells would.  The
-        updates end if the mean gap no longer falls by half: the cells cannot follow the side any further.
+        A body such as one of sealed water resists the side's motion more stiffly than a single cell would.  The updates
+        end if the mean gap no longer falls by half: the cells cannot follow the side any further.
         """
         if not self._place.dt:
             return False
@@ -297,12 +297,12 @@ class HoldLoads(Loads):
         self._forms.pull.assemble_vector(b, self.data)
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the penalty stiffness; `counted` has the forces on nodes at grid boundary conditions."""
+        """Add the penalty stiffness; `counted` returns its forces on walls of the grid."""
         if not walls:
             self._forms.hold.assemble_matrix(A, self.data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the same conditions with gaps reduced by a displacement u."""
+        """Return the same penalties with gaps reduced by a displacement u."""
         out = copy(self)
         out.data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
         return out
@@ -321,14 +321,14 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return degrees of freedom (n,), and the reactions' forces (n,), N, on them."""
+        """Return degrees of freedom (n,), and the penalty forces (n,), N, on them for the forces of walls."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )
         return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return u with rigid motions of the parts that the conditions rotate; None if they rotate none."""
+        """Return u with rigid motions of the parts that the conditions rotate; None if there is no such part."""
         grid = self.data.points.grid
         if grid.axisymmetric:
             return None
@@ -341,7 +341,7 @@ class HoldLoads(Loads):
         return moved
 
     def touching(self) -> tuple:
-        """Return cells, positions and directions of the prescribed components."""
+        """Return cells, positions and directions of the prescribed components, for the check of supports."""
         return self.data.cells, None, self.data.x, self.data["direction"]
 
     @property
@@ -357,7 +357,7 @@ class HoldLoads(Loads):
         return of_cells + 4 * EPSILON * grid.reach * held
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Refuse a step in which the bodies did not follow the sides."""
+        """Raise NotConverged if the bodies did not follow the sides."""
         self._acting.check_came(self._place, points, before)
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:

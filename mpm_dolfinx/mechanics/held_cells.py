@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides in the cells: a stiff penalty on the mean, a weak one on the deviation from it.
+"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak one on deviations from the mean.
 
 A Q1 field has too few nodal displacements in a cell to meet constraints at many points of a side. A stiff penalty at
-each of them would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero
-mean in each cell. The present traction of the body, rotated with the side, is applied explicitly. Both penalties then
-carry the traction increment of the step only, and their gap is smaller by that factor.
+each point would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero mean
+in each cell. The present traction of the body, rotated with the side, is applied explicitly. Both penalties then bear
+the traction increment of the step only, and the gap between side and prescribed position is smaller by that factor.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side relative to a grid axis at which cells can follow all its points, even at constant volume."""
+"""Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
 EVERYWHERE = 1e2
-"""Normal penalty stiffness at each point of such a side, in units of (resisting modulus) / (cell size).
+"""Normal penalty stiffness at each point of a side with a slope below `ALIGNED`, in units of resistance / cell size.
 
-Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.2e-05, twice by 1.7e-05, finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor of a side's stress in the penalty's modulus: a side with a penalty softer than its stress buckles.
+"""Factor of a side's stress in the modulus of the penalty: a side buckles if its stress exceeds the penalty.
 
-Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.8e-06, twice by 4.7e-06, finer cells by 3.0e-02.
 """
-CARRIED = 0.3  # traction increment of a step over resisting modulus and stress: larger ones are not physical
+CARRIED = 0.3  # largest plausible traction increment of a step / (resisting modulus and stress of the body)
 
 
 class HeldPoints(NamedTuple):
-    """Integration points on sides with prescribed displacements; arrays over n points in owned cells.
+    """Integration points on sides with prescribed displacements; arrays for n points in owned cells.
 
-    number, cell : (n,) condition and local cell; area : (n,) reference area, m^(d-1); x : (n, d) position, m; gap : (n,
-    d) prescribed minus present position, m; given : (n, 2 d) prescribed displacements at start and end of the step, m.
-    modulus, tension, resistance, firm : (n,) penalty modulus, stress norm at the last reset of the grid, resisting
-    modulus and confined modulus, all times area, N. normal : (n, d) area vector at the last reset, m^(d-1); force : (n,
-    d) present force, rotated with the side, N.
+    number, cell (n,): condition and local cell; area (n,): reference area, m^(d-1); x (n, d): position, m.
+    gap (n, d): prescribed minus present position, m; given (n, 2 d): prescribed displacements at both ends of the step.
+    modulus, tension, resistance, firm (n,): penalty modulus, norm of the stress, resisting modulus and confined modulus
+    at the last reset of the grid, all times area, N.
+    normal (n, d): area vector at the last reset, m^(d-1); force (n, d): present force, rotated with the side, N.
     """
 
     number: NDArray[np.int64]
@@ -60,7 +60,7 @@ class HeldPoints(NamedTuple):
 
 
 class HeldCells:
-    """Penalty rows of prescribed displacements: means, one for each condition and cell, then points.
+    """Penalties of prescribed displacements: on means, one for each condition and cell, and then at points.
 
     Parameters
     ----------
@@ -72,13 +72,13 @@ class HeldCells:
     Attributes
     ----------
     number, cell, x, shape, moments
-        Condition, cell, mean position (m), mean shape functions, and mean products of the offsets from the cell's
-        midpoint, one for each row.
+        Condition, cell, mean position, m, mean shape functions, and mean products of the distances from the cell's
+        midpoint, m, for each penalty.
     stiffness, limit
-        Penalty stiffness of each component, N/m, with the confined modulus along the normal of a side along the grid;
-        for means, the largest plausible force, N. Larger forces are artefacts.
+        Penalty stiffness of each component, N/m, from the confined modulus along the normal of a side parallel to the
+        grid.  Largest plausible force of each mean, N; larger forces are artefacts.
     way
-        Increment (d,) of the prescribed displacement in the step, m, for each row.
+        Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):
@@ -119,7 +119,7 @@ class HeldCells:
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
         self.stiffness = both(HOLD / h[0] * modulus, each / h[1])
-        # at the end of a side, a small part of a cell may carry the whole force of a node
+        # at the end of a side, a small area in a cell may bear the whole force of a node
         short = np.maximum(1.0, grid.smallest_faces(cell) * grid.around(x) / whole)
         self.limit = CARRIED * total(p.resistance + TENSE * p.tension) * short
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
@@ -129,26 +129,26 @@ class HeldCells:
         self.way = np.diff(self._given.reshape(-1, 2, grid.dim), axis=1)[:, 0]
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
-        """Return the rows that prescribe a component, with stiffness, gap and nodal fractions.
+        """Return the penalties on one component, with stiffness, gap and nodal fractions of the force.
 
-        A row leaves out nodes that a wall fixes, if the side runs into the wall. Otherwise the free nodes of the cell
-        would compensate for the fixed ones, with an oscillation along the side. Some sides move at such a wall by more
-        than half of their displacement in the cell, at the start or the end of the step. The displacement then bends
-        over this cell. The row is dropped if other rows already hold some of its free nodes.
+        Where a side meets a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
+        would compensate for the fixed ones, with an oscillation along the side. If a side moves at such a wall by more
+        than half of its displacement in the cell, its displacement must vary over this cell. This is checked at the
+        start and the end of the step. The penalty is then omitted if other penalties hold a free node of the cell.
 
         Parameters
         ----------
         axis
             The component.
         given : (conditions,)
-            Conditions that prescribe it.
+            Conditions that prescribe the component.
         free : (nodes,)
             Nodes that no wall fixes in this component.
 
         Returns
         -------
-        Rows (k,); their stiffness (k,), N/m; gaps (k,), m; fractions (k, 2^d) of the force on each node, without the
-        wall's part; index of a row that must move but has fixed nodes only, or -1.
+        Indices of the penalties (k,); their stiffness (k,), N/m; gaps (k,), m.  Fractions (k, 2^d) of the force on each
+        node, without the wall's part.  Index of a penalty that must move but has fixed nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -174,7 +174,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which rows (k,) have a node at a wall, and another node that a row without nodes at walls also has.
+        """Return which penalties (k,) have a node at a wall, and also a free node of a penalty away from walls.
 
         number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): flags of nodes at a wall.
         """
@@ -195,16 +195,16 @@ class HeldCells:
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the conditions whose force exceeds its limit, with the position (d,), m, of the largest excess.
 
-        A Q1 field cannot always meet the means of two neighbouring cells, as for a side along a grid line. The
-        penalties then push the side to and fro. Only their sum at the nodes acts on the body and counts in the
-        reaction. A row therefore exceeds its limit only if both its own force and the condition's nodal forces do.
+        A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
+        penalties then push the side to and fro. Only the sum of their forces at the nodes acts on the body and counts
+        in the reaction. A penalty thus exceeds its limit only if its own force and the condition's nodal forces do.
 
         Parameters
         ----------
         row, axis, force : (k,)
-            Rows, components, and forces, N.
+            Indices of penalties, components, and forces, N.
         told
-            Numbers of conditions that have been reported already, which are left out.
+            Indices of conditions that have been reported already; they are excluded.
         """
         grid = self.grid
         comm = grid.comm

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Inertia: consistent mass, velocities of points and nodes, and accelerations in the substeps.
+"""Inertia: consistent mass, velocities of material points and nodes, and accelerations in the substeps.
 
-A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. The displacement u^ of free flight is
+A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. The inertial predictor (no forces) is
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-The weights g and b belong to the substep's own rate and to that of the previous substep (`time_integration`). Only
-velocities are carried from step to step. In each step SDIRK2 dissipates GAMMA^4 (omega dt)^4, 0.74 % of (omega dt)^4,
-of an oscillation's energy. It damps modes that the step cannot resolve.
+The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`). Only velocities
+are carried from step to step. In each step SDIRK2 dissipates GAMMA^4 (omega dt)^4, 0.74 % of (omega dt)^4, of an
+oscillation's energy. This dissipation damps modes that the step cannot resolve.
 
 The mass is integrated over the pieces of the particle domains, with second moments S about their centroids x_k,
 
@@ -15,9 +15,9 @@ The mass is integrated over the pieces of the particle domains, with second mome
 
 with the ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full. G vanishes for affine
 fields, for which M and the right side agree. The transfer to the grid and back therefore conserves linear and angular
-momentum to rounding. Points carry v and the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain. Its
-increments come from the grid (Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992). The
-first substep of SDIRK2 is a midpoint rule: `chord` corrects its rotations.
+momentum to rounding. Material points carry v and F', the rate of F; the velocity over their domain is v + F' F^-1 (x -
+x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and
+Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects its error for rotations.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass. With 0.002 and 0.2, momentum and energy of a turning block do not change.
+"""Strength c of the ghost mass. With 0.002 and 0.2, momentum and energy of a rotating block do not change.
 
 `tests/test_inertia.py` tests this.
 """
 RELAXES = 2.0
-"""Relaxation rate of point velocities towards grid velocities, per cell that the domain's corners have moved.
+"""Relaxation rate of point velocities towards grid velocities, per cell size of motion of the domain's corners.
 
-It removes velocity modes of the points that the nodes cannot represent. In a test, a bar of 20 cells vibrates and flies
-over 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates of 0,
-0.1, 2 and 10. The energy loss is 1.58, 1.60, 1.60 and 1.67 %.
+Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
+moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates
+of 0, 0.1, 2 and 10. The energy loss is 1.58, 1.60, 1.60 and 1.67 %.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"
@@ -63,19 +63,19 @@ VELOCITY, RATE = "velocity", "F_rate"
 
 
 def resting(points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return velocity and rate of F of points at rest."""
+    """Return velocity and rate of F, both zero, of points without motion."""
     return moving(points, np.zeros(points.x.shape[1]), 0.0)
 
 
 def checked_velocity(
     grid: Grid, quadrature: str, inertia: bool | None, velocity: ArrayLike | Callable | None
 ) -> ArrayLike | Callable | None:
-    """Return the initial velocity of a scene with the argument `inertia`, zero by default; None if `inertia` is None.
+    """Return the initial velocity of a scene, zero by default; None if the argument `inertia` of the scene is None.
 
     Raises
     ------
     ValueError
-        A velocity without inertia, or inertia with a scene that does not support it.
+        A velocity is given without inertia, or the scene does not support inertia.
     """
     if inertia is None:
         if velocity is not None:
@@ -83,9 +83,9 @@ def checked_velocity(
         return None
     flag("inertia", inertia)
     if quadrature != "domain":
-        raise ValueError(f"inertia = {inertia}: not with quadrature {quadrature!r}, must be left out")
+        raise ValueError(f"inertia = {inertia} with quadrature {quadrature!r}, must be None")
     if velocity is not None and not inertia:
-        raise ValueError(f"velocity = {line(velocity)}: bodies are at rest at first, must be given with inertia=True")
+        raise ValueError(f"velocity = {line(velocity)}: no inertia at first, must be given with inertia=True")
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
     elif grid.axisymmetric and velocity is not None and np.ravel(velocity)[:1].any():
@@ -104,7 +104,7 @@ def moving(
     Parameters
     ----------
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Velocity, or a function of position; particle domains take the affine field nearest to its corner values.
+        Velocity, or a function of position.  Each domain stores the affine field nearest to its values at the corners.
     base : (d,), m
         Origin of the points' coordinates.
     rings
@@ -134,7 +134,7 @@ def moving(
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d); for 2 x 2 matrices in a tenth of numpy's time."""
+    """Return the inverses of matrices (n, d, d); 2 x 2 matrices are inverted in a tenth of numpy's time."""
     if A.shape[1] > 2:
         return np.linalg.inv(A)
     (a, b), (c, e) = A.transpose(1, 2, 0)
@@ -143,14 +143,14 @@ def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the effective increment F~ - 1 of laws in a midpoint rule, and the rotation of their stress.
+    """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of their stress.
 
-    The rule takes F from F_n to F_n + 2 D, with its midpoint F = F_n + D. The mean of C = F^T F at both ends is F^T F +
+    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D. The mean of C = F^T F at both ends is F^T F +
     D^T D. Laws are evaluated at
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
-    A rigid rotation then causes no strain, however stiff the body is. P F^T is symmetric, so moments balance.
+    A rigid rotation then causes no strain in any body. P F^T is symmetric, so moments balance.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class InertiaForms:
-    """The compiled forms of inertia, and their coefficients in the forms of stresses and fluxes.
+    """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ class InertiaForms:
         self.acceleration = self._rate * (u - self._flight)
         """Acceleration at u as UFL, m/s^2."""
         self._midpoint = fem.Constant(grid.mesh, 0.0)
-        for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # rings never rotate
+        for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
             chords: Latest[tuple[NDArray, NDArray]] = Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
             seen.follow("turn", (d, d), partial(self._seen, chords, 1))
@@ -200,21 +200,21 @@ class InertiaForms:
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the acceleration in the forms, zero without inertia; midpoint: whether the substep is a midpoint rule."""
+        """Set the acceleration in the forms, or zero if inertia is None; midpoint: whether the substep is one."""
         self._midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the accelerations (n, d), m/s^2, at u in cells, from values (n, 2^d) of the shape functions."""
+        """Return the accelerations (n, d), m/s^2, at u; cells (n,); values (n, 2^d): shape functions at the places."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return effective gradients for the laws, or rotations of their stress, (n, d^2): see `chord`.
+        """Return gradients for the laws, or rotations of their stress, (n, d^2), at the present u: see `chord`.
 
-        chords: the last result, which all forms at the same u share; which: 0 for gradients, 1 for rotations.
+        chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
         """
         G, d = data.gradients(self._u.x.array), self.grid.dim
         if self._midpoint.value:
@@ -265,7 +265,7 @@ class InertiaForms:
 
 
 class Mass:
-    """The mass of the bodies on the grid, while a cut is valid.
+    """Mass of the bodies on the grid, constant until the next reset of the grid.
 
     Parameters
     ----------
@@ -274,11 +274,11 @@ class Mass:
     cut
         The cut particle domains.
     pieces
-        Their pieces, with masses, kg, as weights.
+        Integration points of the pieces, with masses, kg, as weights.
     unknowns
         Unknown displacements.
     M, held
-        Mass matrices, kg: of the unknowns, and with rows for displacements fixed by grid boundary conditions.
+        Mass matrices, kg: rows of the unknowns, and rows of displacements that walls of the grid fix.
     """
 
     def __init__(
@@ -298,7 +298,7 @@ class Mass:
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
-        """Return the velocities of the unknowns, m/s: the projection of the point velocities."""
+        """Return the velocities of the unknowns, m/s, projected from the velocities of the points."""
         cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
         L = velocity_gradients(points)
         v = points.data[VELOCITY][cut.pieces.point] + np.einsum("nij,nj->ni", L[cut.pieces.point], self._off)
@@ -314,16 +314,16 @@ class Mass:
     def carried(
         self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], moved: NDArray[np.float64]
     ) -> dict[str, NDArray[np.float64]]:
-        """Return velocities and rates of F of the points after a step.
+        """Return velocities and rates of F of the material points after a step.
 
         Parameters
         ----------
         points
-            Points at the start of the step.
+            Material points at the start of the step.
         velocities
             Velocities of the unknowns at the start and the end of the step, m/s.
         moved : (n,)
-            Largest motion of a corner in cells if the grid is reset, else 0.
+            Largest displacement of a domain's corner, divided by the cell size, if the grid is reset, else 0.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -353,7 +353,7 @@ class Mass:
         return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return `VELOCITY` and `RATE` of the affine field over each domain that is nearest to nodal velocities v."""
+        """Return `VELOCITY` and `RATE` of the affine field in each domain nearest to nodal velocities v, m/s."""
         cut, grid, d, nodal = self._cut, self._forms.grid, self._forms.grid.dim, self.local(v)
         at, slope = grid.at(cut.cells, cut.x, nodal.reshape(-1, d)), self._pieces.gradients_of(nodal)
         at, slope = (cut.to_pieces(values) for values in (at, slope.reshape(-1, d, d)))
@@ -363,22 +363,22 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry without the circumferential component."""
+    """Return the velocity gradients (n, d, d), 1/s, of the points; in axisymmetry the components in the plane."""
     d = points.x.shape[1]
     return points.data[RATE] @ inverses(points.F[:, :d, :d])
 
 
 class Inertia(Loads):
-    """Inertia in a substep.
+    """Inertia forces in a substep.
 
     Parameters
     ----------
     mass
         Mass of the bodies on the grid.
     flight
-        Displacement of free flight, m.
+        Inertial predictor: displacement without forces, from the velocities alone, m.
     rate
-        (Weight of the substep's own rate, s)^-2, 1/s^2.
+        g^-2, with the weight g of the substep's own rate, s, in 1/s^2.
     """
 
     holding = True
@@ -388,7 +388,7 @@ class Inertia(Loads):
 
     @cached_property
     def flight(self) -> NDArray[np.float64]:
-        """The displacement of free flight, a local array, m."""
+        """The inertial predictor: displacement without forces, from the velocities alone, m; a local array."""
         return self._mass.local(self._flight)
 
     def acceleration(self, at: At) -> PETSc.Vec:
@@ -403,12 +403,12 @@ class Inertia(Loads):
         return self._mass.M * self.acceleration(at)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Add the inertia of the unknowns to the forces on fixed nodes."""
+        """Add the inertia forces to the residual at fixed nodes."""
         if on is not self._mass.unknowns:
             residual += self._mass.held * self.acceleration(at)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a zero matrix with the sparsity of the mass."""
+        """Return a zero matrix with the sparsity of the mass matrix."""
         zeros = self._mass.M.copy()
         zeros.zeroEntries()
         return zeros
@@ -425,14 +425,14 @@ class Inertia(Loads):
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns, m/s, at the start of a step and after a substep; last acceleration, m/s^2."""
+    """Velocities of the unknowns at the start of a step and after a substep, m/s; last acceleration, m/s^2."""
 
     start: PETSc.Vec
     velocity: PETSc.Vec
     acceleration: PETSc.Vec | None = None
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the displacement of free flight at the end of the next substep, m; own, before: its weights, s."""
+        """Return the inertial predictor of the next substep, m; own, before: weights of this and the last rate, s."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
-Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral: with nu = 0.499 it is up to half too
-stiff. F-bar evaluates the law at a deformation gradient whose volume ratio of the step is the cell's mean theta,
+Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
+0.499. F-bar evaluates the law at a deformation gradient whose volume ratio of the step is the cell's mean theta,
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-The scaling acts along all three axes: in plane strain the points carry an out-of-plane stretch, as in a slice of the
-body. The material decides whether it locks (`Skeleton.nearly_incompressible`). In a cell of several materials the other
-materials take their own F. The energy sum w psi(Fbar) / J_n has the derivative
+The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a slice of the
+body. The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of several materials,
+materials that would not lock use F. The energy sum w psi(Fbar) / J_n has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-For given (theta, pi) the residual has one more term of the energy, and the tangent is symmetric. The contribution of
+For given (theta, pi) the residual has the additional term with pi, and a symmetric tangent. The contribution of
 theta and pi has rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material point method:
-Coombs et al. 2018). A law without an energy has P(Fbar) : dFbar in place of dPsi. The points keep Fbar. The next step
-starts from a J_n that follows from the particle domains in the cell (`cell_ratios`).
+Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar. The next step
+starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
 class MeanDilatation:
-    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi.
+    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
     Parameters
     ----------
     grid
         Background grid.
     numbers
-        Indices of the parts that lock, see `QuadratureData`, in the order of the calls of `add`.
+        Indices of the parts in which cells would lock, see `QuadratureData`, in the order of the calls of `add`.
     symmetric
         Whether the tangents of all laws are symmetric.
     """
@@ -65,12 +65,12 @@ class MeanDilatation:
         self._stresses: list[StressAtPoints] = []
 
     def fbar(self, points: FormPoints, F):
-        """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that are defined in the plane only."""
+        """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that accept only F (2, 2)."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
         if self._grid.stretches == 2 and ACROSS not in points.functions:
             return ufl.variable(ufl.sqrt(ratio) * F)
         ratio = ratio ** (1 / 3)
-        if self._grid.stretches == 2:  # F is scaled to its determinant, see `in_space`
+        if self._grid.stretches == 2:  # F and the out-of-plane stretch are scaled together, see `in_space`
             across = getattr(points, ACROSS)
             return ufl.variable(embedded(ratio / ufl.sqrt(across) * F, ratio * across))
         return ufl.variable(block(ratio * F) if self._grid.axisymmetric else ratio * F)
@@ -85,14 +85,14 @@ class MeanDilatation:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Add the pieces of a part that locks.
+        """Add the integration points of one part, whose Q1 cells would lock without F-bar.
 
         Parameters
         ----------
         law
             Class of the part's law.
         points
-            Pieces of the part, with the field F (d, d), the deformation gradient at the start of the step.
+        Integration points of the part, with the field F (d, d): deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
@@ -106,8 +106,8 @@ class MeanDilatation:
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative with respect
-        to F (d, d, d, d), Pa, for the tangent; and further sums of the tangent in each cell, for `assemble_matrix`.
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  Its derivative with respect
+        to F (d, d, d, d), Pa, for the tangent.  Quantities to be summed in each cell, for `assemble_matrix`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         self._ratios.append(CellSums([ratio], points))
@@ -120,7 +120,7 @@ class MeanDilatation:
         return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
+        """Return the derivatives of psi(Fbar), or of a law's work without energy, with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -135,18 +135,19 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with pieces that lock, the totals of sums over these, and their volumes (cells, 1)."""
+        """Return the cells with F-bar, the sums over all their parts, and their volumes with F-bar (cells, 1)."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In the plane a law without an energy is differentiated with respect to Fbar only, in half of the time. With Fbar
+        In 2D a law without an energy is differentiated with respect to Fbar only, which takes half of the time. With
+        Fbar = s F
         = s F
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        for F (d, d) and the part of s F in its axes. In 3D this would take two minutes to compile.
+        for F (d, d) and the same components of s F. In 3D this would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self._grid.dim == 3:
@@ -162,7 +163,7 @@ class MeanDilatation:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return the derivative of a component of tau with respect to F; C: derivative with respect to Fbar."""
+            """Return dtau/dF for one component of tau; part(a, b): dtau/dFbar; by_theta: dtau/dtheta."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n
@@ -174,20 +175,20 @@ class MeanDilatation:
         return P_F, _dev(tau_theta, F) * G, mean_F / theta, (mean_theta - slope) / theta
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
-        """Set theta, the stresses and pi at the present displacement; solve: solves for the laws' local unknowns."""
+        """Set theta, the stresses and pi at the present displacement; solve: function that solves local unknowns."""
         self._set_mean(self.theta, self._ratios, data)
         solve()
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f to the mean of a quantity over the locking pieces of each cell; sums (cells, 1): its sums."""
+        """Set f to the mean of a quantity over the pieces with F-bar in each cell; sums: functions of each part."""
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises it.
+        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
 
-        sums: for each part, the sums (cells, quantities) that `add` asked for.
+        sums: for each part, the sums (cells, quantities) of the quantities that `add` returned.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
@@ -202,7 +203,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
-        """Return the gradients Delta (m, d, d) of the pieces; locking ones take the volume ratio of their cell."""
+        """Return the gradients Delta (m, d, d) of the pieces, scaled to the cell's volume ratio where F-bar is used."""
         delta = delta.copy()
         for number in self._numbers:
             rows = data.rows[number]
@@ -214,12 +215,12 @@ class MeanDilatation:
         return [data.parts[number] for number in self._numbers]
 
     def _cells(self, data: QuadratureData) -> Cells:
-        """Return the cells with locking pieces."""
+        """Return the cells with pieces that use F-bar."""
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the volumes (cells, 1) of the locking pieces."""
+        """Return the volumes (cells, 1), m^d, of the pieces that use F-bar."""
         key = tuple(part.key for part in self._parts(data))
 
         def volumes() -> NDArray[np.float64]:
@@ -230,20 +231,20 @@ class MeanDilatation:
 
 
 def _dev(tau, F):
-    """Return the deviator of a UFL tensor in the axes of F (d, d)."""
+    """Return the components (d, d) of the deviator of a UFL tensor, in the axes of F (d, d)."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 
 class StressAtPoints:
-    """Stress P of a law, and its derivative by theta, at the points of a part: evaluated once for residual and pi.
+    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
 
     Parameters
     ----------
     P, slope
         UFL expressions at the points: (d, d) and scalar.
     points
-        The points.
+        Integration points of the part.
     """
 
     def __init__(self, P, slope, points: FormPoints):
@@ -254,12 +255,12 @@ class StressAtPoints:
         """The stress as UFL, with the values of the last evaluation."""
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate stress and derivative at the points; return the sums (cells, 1) of the derivative in their cells."""
+        """Evaluate stress and derivative; return the sums (cells, 1) of the derivative in the cells of the points."""
         _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
         return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
 
     def _stress(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stresses (n, d^2), Pa."""
+        """Return the stresses (n, d^2), Pa, of the last evaluation."""
         of, values = self._last.value or (None, None)
         if of is not data.key:
             raise RuntimeError("stresses at points are used before their evaluation")
@@ -267,14 +268,14 @@ class StressAtPoints:
 
 
 class Cells:
-    """The cells of several parts; filled: all of them; where: indices of each part's cells in `filled`."""
+    """Cells of several parts; filled: all of them; where: indices of each part's cells in `filled`."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over all parts."""
+        """Return the sums (cells, quantities) of the parts' values."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

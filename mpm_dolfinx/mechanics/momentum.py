@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Balance of momentum: Q1 on the grid, integrated over pieces, the parts of particle domains in cells.
+"""Balance of momentum: Q1 displacements on the grid, integrated over the pieces of particle domains in cells.
 
 The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J = det F. The residual is the
 derivative of
@@ -7,8 +7,8 @@ derivative of
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
 
 that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions. P' is the first
-Piola-Kirchhoff effective stress relative to the start of the step. A law may also give the stress. UFL takes the
-derivatives.
+Piola-Kirchhoff effective stress relative to the start of the step. A law may define the stress instead of psi. UFL
+computes the derivatives.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
+from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.mechanics.dried import OfSuction
@@ -43,37 +44,32 @@ from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.active import Active, ActiveSet
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
-from mpm_dolfinx.pores.retention import Retentions
 
 
 class MomentumForms:
-    """The compiled forms of the balance of momentum of a scene.
+    """Compiled forms of the balance of momentum of a scene.
 
     Parameters
     ----------
     pieces
         All integration points.
     laws
-        Classes of the skeletons' laws, each with its integration points and whether it takes F-bar, see
-        `MeanDilatation`. The points carry F, the law's parameters and state and, with fluid, biot.
+        Classes of the skeletons' laws, each with its integration points and whether it uses F-bar, see
+        `MeanDilatation`. The points have F, the law's parameters and state and, with fluid, biot.
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
-        Acceleration, a UFL constant; the points then carry `density`, kg/m^3, at the start of the step.
-    fluid_density : kg/m^3
-        Density of the pore fluid that fills pores as they dilate; None without fluid.
-    symmetric
-        Whether the tangents of all laws are symmetric.
+        Acceleration, a UFL constant; the integration points then have `density`, kg/m^3, at the start of the step.
+    materials
+        Materials of the scene, and its fluid. With retention curves the points also carry retention, lever and pores.
     at_points
-        Whether bodies are integrated at their points.
+        Whether bodies are integrated at their material points.
     terms
         User-defined terms, see `user_functions`.
     t, dt : s
         Time at the end of the substep, and time since the start of the step, UFL constants.
     inertia
         Whether bodies may have inertia.
-    retentions
-        Retention laws of the scene, if some soil is unsaturated; the points then carry retention, lever and pores.
     """
 
     def __init__(
@@ -82,53 +78,53 @@ class MomentumForms:
         laws: Sequence[tuple[type[Skeleton], FormPoints, bool]],
         pressure: fem.Function | None,
         gravity: fem.Constant | None,
-        fluid_density: float | None,
-        symmetric: bool,
+        materials: SceneMaterials,
         at_points: bool,
         terms: Sequence[Callable],
         t: fem.Constant,
         dt: fem.Constant,
         inertia: bool = False,
-        retentions: Retentions | None = None,
     ):
         self.grid = grid = pieces.grid
-        self._retentions = retentions
+        self._retentions = retentions = materials.retentions
+        symmetric = materials.symmetric
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
         """Displacement increment since the start of the step, m."""
         rooms = [fem.Function(V) for _ in range(3)]
-        self._rooms = [(room, room.x.array) for room in rooms]  # buffers for simultaneous sums of forces
+        self._rooms = [(room, room.x.array) for room in rooms]  # buffers for sums of forces that exist together
         averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
         self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
-        """Forms of inertia, None without."""
-        self._residuals, self._tangents = [], []
+        """Forms of inertia, None in a scene without inertia."""
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
         self._of_suction = OfSuction(grid, self.dilatation) if dried else None
         self._local: dict[int, LocalUnknowns] = {}  # by index of the part
+        made = []
         for number, (law, points, locks) in enumerate(laws):
-            self._add_law(
-                number, law, points, locks, pressure, symmetric, by_scene(grid, None, law, points) | {"dt": dt}
-            )
+            given = by_scene(grid, None, law, points) | {"dt": dt}
+            made.append(self._forms_of_law(number, law, points, locks, pressure, symmetric, given))
+        self._residuals, self._tangents = zip(*made, strict=True)
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
-        """The forms of conditions."""
+        """Forms of the scene's conditions."""
         self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
         full = None if retentions is None else retentions.of("saturation", pressure, pieces)
-        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
+        wet = materials.fluid and materials.fluid.density
+        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, wet, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
-        """Loads that act in all stages."""
+        """Weight and user-defined terms, which act in all stages."""
         self.symmetric = symmetric and self.own.symmetric
         self.linear = not averaged and all(law.linear for law, *_ in laws)
-        """Whether the tangent of the laws depends on the positions of the points only."""
+        """Whether the tangent of the laws depends only on the positions of the points."""
         self.elastic = not any(law.state for law, *_ in laws)
-        """Whether no law has a state: in yielding soil the tangent of one substep misleads the next."""
+        """Whether no law has a state: in yielding soil the tangent of one substep is wrong for the next."""
         self.ghost = GhostPenalty(grid, V, at_points)
         kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *rooms)]
         self.active = Active(grid, pressure is not None, *kept)
-        """The active cells; u is zero at other nodes."""
+        """Active cells; u is zero at nodes of other cells."""
 
-    def _add_law(
+    def _forms_of_law(
         self,
         number: int,
         law: type[Skeleton],
@@ -137,8 +133,8 @@ class MomentumForms:
         pressure: fem.Function | None,
         symmetric: bool,
         given: Mapping[str, fem.Constant],
-    ) -> None:
-        """Compile residual and tangent of the integration points of a law."""
+    ) -> tuple[ElementForces, ElementMatrices | StackedElementMatrices]:
+        """Return the compiled residual and tangent of the integration points of a law."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
         p = None
@@ -151,7 +147,7 @@ class MomentumForms:
             values, known = values | local.values, values | local.known
         else:
             known = values
-        # derivatives by F, contracted: they compile in a twentieth of the time of derivatives by u in 3D
+        # derivatives with respect to F, contracted; derivatives with respect to u compile twenty times as long in 3D
         beside = Beside()
         if locks:
             ratio = ufl.det(points.increment(self.u))
@@ -166,32 +162,31 @@ class MomentumForms:
             if self._retentions is not None:
                 of_pressure = self._retentions.of("bishop", pressure, points) * of_pressure
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
-        share = 1 / ufl.det(points.F)  # a common factor: dividing would divide each component
+        share = 1 / ufl.det(points.F)  # a common factor: a division would be compiled for each component
         P, A = share * P, share * A
         stress = P * points.F.T
         turns = self.inertia is not None and not self.grid.axisymmetric
-        self._residuals.append(ElementForces(points.turn * stress if turns else stress, points))
+        residual = ElementForces(points.turn * stress if turns else stress, points)
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
             beside = beside._replace(along=[T * points.F.T for T in beside.along])
-            self._tangents.append(ElementMatrices(A, points, symmetric, beside))
-        else:
-            self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
+            return residual, ElementMatrices(A, points, symmetric, beside)
+        return residual, StackedElementMatrices(A, points, symmetric, beside)
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return derivatives of forces with respect to cell pressures through suction, see `OfSuction.rows`."""
+        """Return derivatives of nodal forces with respect to cell pressures through suction: `OfSuction.rows`."""
         return [] if self._of_suction is None else self._of_suction.rows(data)
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
-        """Set the contents of the owned cells (n,) that are not empty, and the active set: see `GhostPenalty`."""
+        """Set the contents of the owned cells (n,) with material; return the active set: see `GhostPenalty`."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the sum of nodal forces over all processes, in buffer `room`, a local array; adders add the forces."""
+        """Return the sum of nodal forces that `adders` add, over all processes, a local array; room: its buffer."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -204,7 +199,7 @@ class MomentumForms:
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u, a local array, with `Loads.takes_up`."""
+        """Return the nodal forces of the stresses at u and of `Loads.takes_up`, N, a local array."""
 
         def solve() -> None:
             for number, local in self._local.items():
@@ -221,7 +216,7 @@ class MomentumForms:
         return self.summed(0, [add, *(one.takes_up for one in loads)])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
-        """Add the tangent of the stresses at u to K; the caller finalises it."""
+        """Add the tangent of the stresses at u to K; the caller finalises K."""
         for number, local in self._local.items():
             local.derive(data.parts[number])
         sums = [tangent.assemble_matrix(K, part) for tangent, part in zip(self._tangents, data.parts, strict=True)]
@@ -229,7 +224,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (nodes,) at the active local nodes of values (cells,) of owned cells, over all processes."""
+        """Return sums (nodes,) of cell values at the active local nodes, over all processes; values of owned cells."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
         nodes = self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
@@ -240,9 +235,9 @@ class MomentumForms:
         return values_at[nodes * d]
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
-        """Return the connected parts of the bodies in active cells, from the parts of the cells: see `parts_of_cells`.
+        """Return the connected parts of the bodies in active cells; of, count: result of `parts_of_cells`.
 
-        Contact couples the groups of bodies: with several groups there is one part.
+        With several groups of bodies there is one part, because contact couples the groups.
         """
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
         if grid.copies > 1:
@@ -255,7 +250,7 @@ class MomentumForms:
         return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return the nodes of active cells of any process."""
+        """Return which local nodes belong to active cells of any process; cells: active cells of this process."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
@@ -273,7 +268,7 @@ def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> lis
 
 
 class MomentumSystem:
-    """Vectors and matrices of the displacements of one active set.
+    """Vectors and matrices of the balance of momentum for one set of active cells.
 
     Parameters
     ----------
@@ -284,7 +279,7 @@ class MomentumSystem:
     cells
         Active cells of this process.
     facets
-        Faces of this process that carry the ghost penalty.
+        Faces of this process with a ghost penalty.
     stiff
         Whether plates or prescribed displacements have a penalty.
     parts
@@ -303,19 +298,19 @@ class MomentumSystem:
         self._forms, d = forms, forms.grid.dim
         self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
         self.locks = forms.dilatation is not None
-        """Whether some law takes F-bar: it yields, or is nearly incompressible."""
+        """Whether some law uses F-bar: soil that yields or is nearly incompressible."""
         active = forms.active.now.dofs
         self.touched = active[active < d * forms.u.function_space.dofmap.index_map.size_local]
-        """Degrees of freedom on which forces may act, fixed or free."""
+        """Owned degrees of freedom of active cells, fixed or free."""
         self.parts, comm = parts, forms.grid.comm
         self.of_parts, self._touched = (
             OfParts(comm, parts.nodes[at // d], parts.count) for at in (self.unknowns.owned, self.touched)
         )
-        """Parts of the unknowns, and of the degrees of freedom `touched`."""
+        """Connected part of each unknown, and of each degree of freedom in `touched`."""
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """Rounding error of a part, N, if all of its unknowns had the rounding error of this unknown."""
+        """Rounding error of a connected part if all its unknowns had the error of this unknown, N."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = np.setdiff1d(active, dofs)
@@ -327,17 +322,17 @@ class MomentumSystem:
         at_walls[held // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
         self._ghost = forms.ghost.on(facets, facets[near])
-        self.firm, self._firmness = None, None  # without laws that yield
+        self.firm, self._firmness = None, None  # for scenes without yielding
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
 
     @property
     def round_off(self) -> NDArray[np.float64]:
-        """Rounding error of the residual of each part (parts,), N."""
+        """Rounding error of the residual in each connected part (parts,), N."""
         return self.of_parts.norms(self.rounding.array_r)
 
     def forces_of_parts(self, forces: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the norms (k, parts), N, of k forces on the degrees of freedom `touched`."""
+        """Return the norms (k, parts), N, of k force vectors in each part, over the degrees of freedom `touched`."""
         return self._touched.norms(np.array(forces))
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
@@ -349,7 +344,7 @@ class MomentumSystem:
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], ...] | None:
-        """Lines of a grid of many cell sizes, else None: see `multigrid_solver`."""
+        """Grid lines of a grid with many cell sizes, else None: see `multigrid_solver`."""
         grid = self._forms.grid
         return None if grid.even else grid.lines
 
@@ -387,7 +382,7 @@ class MomentumSystem:
 
 
 class MomentumProblem:
-    """The balance of momentum of one step.
+    """Balance of momentum of one step.
 
     Parameters
     ----------
@@ -400,11 +395,11 @@ class MomentumProblem:
     tolerance
         Tolerance of the residual, relative to the forces.
     goes_on : (unknowns,)
-        Displacements extrapolated from the last step, a local array, m; None if they are unknown.
+        Displacements extrapolated from the last step, m, a local array; None if unknown.
     held : (unknowns,)
-        Forces that balance an initial stress out of equilibrium, a local array, N, if there are any.
+        Forces that balance the initial stress where loads do not, N, a local array, or None.
     yielded
-        Whether any soil has yielded before.
+        Whether any soil has yielded before this step.
     """
 
     def __init__(
@@ -432,12 +427,12 @@ class MomentumProblem:
 
     @property
     def linear(self) -> bool:
-        """Whether the tangent depends on the positions of the points only."""
+        """Whether the tangent depends only on the positions of the points."""
         return self.forms.linear and all(one.linear for one in self.loads)
 
     @property
     def smooth(self) -> bool:
-        """Whether the tangent of one substep may be used in the next."""
+        """Whether the tangent of one substep may be reused in the next."""
         return self.forms.elastic and all(one.smooth for one in self.loads)
 
     @cached_property
@@ -446,17 +441,17 @@ class MomentumProblem:
         return At(self.system.unknowns, self.forms.u.x.array)
 
     def settle(self, sticks: bool) -> bool:
-        """Update the slip set at u, and with `sticks` also return cells to stick; return whether it has changed."""
+        """Update stick and slip at u; return whether any state changed; sticks: whether slip may change to stick."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
     def augment(self) -> bool:
-        """Update multipliers and contact geometry of converged loads; return whether any force has changed."""
+        """Update multipliers and contact geometry of converged loads; return whether any force changed."""
         return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
 
     def guesses(self) -> list[NDArray[np.float64]]:
-        """Return initial guesses of Newton's method: displacements (active dofs,), m.
+        """Return initial guesses of the displacements (active dofs,), m, for Newton's method.
 
-        They are guesses of the loads, such as a rigid rotation, and the extrapolation of the last step.
+        These are the guesses of loads, such as a rigid rotation, and the extrapolation of the last step.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
@@ -469,10 +464,10 @@ class MomentumProblem:
         return r, float(np.linalg.norm(scales))
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
-        """Return the out-of-balance nodal forces at u and their scale (parts,), N, in each part."""
+        """Return the out-of-balance nodal forces at u, N, and the force scale (parts,), N, of each connected part."""
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
-        system.held.gather(b, system.held_residual)  # walls bear the penalty forces of sides next to them
+        system.held.gather(b, system.held_residual)  # before the penalties, which walls bear for sides next to them
         if pulls := [one.pulls for one in self.loads if one.stiff]:
             # not in the scale: at the start of a step they far exceed the forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
@@ -487,11 +482,11 @@ class MomentumProblem:
         return r, np.maximum.reduce(norms)
 
     def unbalanced(self) -> NDArray[np.float64]:
-        """Return the forces of the stresses less the loads at u, a local array, N, without penalties."""
+        """Return the out-of-balance nodal forces at u without penalties, N, a local array."""
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and the norms (parts,), N, of its terms."""
+        """Return the result of `unbalanced`, and the norms (terms, parts) of its terms, N, as a list."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -507,14 +502,14 @@ class MomentumProblem:
         return b, [*system.forces_of_parts([*terms, external])]
 
     def powers(self) -> dict[str, float]:
-        """Return the powers of stresses, viscous resistance, friction and external loads at u on this process, W."""
+        """Return the powers at u of stresses, viscous resistance, friction and external loads of this process, W."""
         forms, unknowns = self.forms, self.system.unknowns
         v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # zero at fixed nodes
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
         out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "friction": 0.0}
         out["external"] = 0.0
         for one in self.loads:
-            acts, resists, taken = np.zeros((3, len(v)))  # contributions to ghosts count on this process
+            acts, resists, taken = np.zeros((3, len(v)))  # contributions to ghost nodes count on this process
             one.dead(acts)
             one.loads(acts)
             one.takes_up(taken)
@@ -531,10 +526,11 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return relative residuals of the parts, without rounding and in full; r: residuals, N; scales (parts,), N.
+        """Return relative residuals of the connected parts, first without rounding errors, then in full.
 
-        The first result leaves out the rounding error at each node, except at first: one solve is made even for a load
-        below the rounding error. The second result takes scales of at least rounding error over tolerance.
+        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node,
+        unless `first`: one solve is made even for a load below the rounding error.  The second result uses scales of
+        at least the rounding error divided by the tolerance.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
@@ -547,7 +543,7 @@ class MomentumProblem:
         return relative(counts, scales), full
 
     def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
-        """Return the forces (d,), N, of the walls by name at u; the residual must have been assembled there."""
+        """Return the forces (d,), N, of the walls at u, by name; the residual must have been assembled at this u."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
         for one in self.loads:
@@ -559,7 +555,7 @@ class MomentumProblem:
         return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
 
     def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outcomes of the conditions at u, by quantity and name."""
+        """Return the reactions and outflows of the conditions at u, by quantity and name."""
         out: dict[str, dict[str, NDArray[np.float64]]] = {}
         for one in self.loads:
             for quantity, values in one.outcome(self.at).items():
@@ -567,7 +563,7 @@ class MomentumProblem:
         return out
 
     def of_suction(self, data: QuadratureData | None = None) -> list[tuple[NDArray, NDArray]]:
-        """Return derivatives of the forces with respect to cell pressures, through suction: see `OfSuction.rows`."""
+        """Return derivatives of nodal forces with respect to cell pressures, through suction: `OfSuction.rows`."""
         return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(
@@ -575,10 +571,10 @@ class MomentumProblem:
     ) -> PETSc.Mat:
         """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
-        data: other integration points than the problem's; firmness: the fraction, one number or one for each part.
+        data: integration points, by default the problem's; firmness: fraction, one number or one per connected part.
         """
         K = self.system.K
-        # the first sums give K its full pattern: PETSc does not always notice a later change
+        # the first sum gives K its full sparsity pattern: PETSc does not always notice a later change
         first = not K.assembled
         zero(K)
         self.forms.assemble_tangent(K, data or self.data)

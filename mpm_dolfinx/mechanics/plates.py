@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid plates: a uniform traction, and a penalty on the slope of the side, kappa/2 int |grad_t u_n|^2 dA."""
+"""Rigid plates: a uniform traction, and a penalty kappa/2 int |grad_t u_n|^2 dA on the slope of the side."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class PlateForms:
-    """Forms at points under plates: stiffness against a slope, and forces that reduce the present tilt."""
+    """Forms of the stiffness against a slope of the plate, and of the forces that reduce its present tilt."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
@@ -55,7 +55,7 @@ class Plates(Acting):
     Raises
     ------
     ValueError
-        The faces of a plate are not one flat side.
+        The faces under a plate are not one flat side.
     """
 
     conditions, title = (RigidPlate,), "rigid plates"
@@ -77,7 +77,7 @@ class Plates(Acting):
         ]
 
     def placed(self, place: Place) -> Loads:
-        """Return the plates in a substep, with their rigidity, normal and present tilt."""
+        """Return the plates in a substep, with their stiffness, normal and present tilt."""
         d = self._grid.dim
         rows = []
         grid = self._grid
@@ -86,12 +86,12 @@ class Plates(Acting):
             patches = place.cut.surface(faces)
             area = patches.area(place.points)
             length = faces.area0.sum() ** (1 / (d - 1))
-            modulus = oedometric[patches.at].max(initial=0.0)  # of the material under the plate only
+            modulus = oedometric[patches.at].max(initial=0.0)  # only of the material under the plate
             rigidity = RIGIDITY * over_all(grid.comm, float(modulus), MPI.MAX) * length
             rigidity = rigidity * np.linalg.norm(area, axis=1, keepdims=True)
             axis = facing(faces)[0]
             normal = np.tile(np.eye(d)[axis], (len(area), 1))
-            tilt = normal - area / area[:, [axis]]  # slope of the face: its normal is (-slope, 1)
+            tilt = normal - area / area[:, [axis]]  # slope of the face; the face's normal is (-slope, 1)
             rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
         cell, x, values = gathered(grid, rows, 1 + 2 * d)
         rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
@@ -101,7 +101,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep; even: their uniform tractions."""
+    """Plates in a substep; even: loads of their uniform tractions."""
 
     stiff = True
 
@@ -133,7 +133,7 @@ class PlateLoads(Loads):
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Refuse faces that are not one flat, connected side in the reference positions: each part would move by itself."""
+    """Raise ValueError unless the faces are one flat, connected side: parts of a plate would move independently."""
     corners, axis = faces.places(), facing(faces)[0]
     tangential = np.arange(corners.shape[2]) != axis
     low = corners.min(axis=1)[:, tangential]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Data of the integration points of a step: fields of the material points and constants of their materials."""
+"""Data of the integration points of a step: fields of the material points, and constants of their materials."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import cell_ratios
 from mpm_dolfinx.domains.domain_slopes import LinearGradients
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
+from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
 """Weight of the corner-based volume ratio of a cell at the start of a step, in units of G / (lambda + 2G), at most 1.
 
-The remaining weight is on the incremental volume ratio of the points. With nu = 0.4999 and a weight of 1 the stress
-changes at a reset of the grid would exceed the stresses that bodies carry.
+The incremental volume ratio of the points has the remaining weight. With nu = 0.4999 and a weight of 1, the stress
+change at a reset of the grid would exceed the stresses in the bodies.
 """
 STIFF_WET = 8
-"""Value of (lambda + 2G) / G at which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 from 0.47.
+"""Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 at 0.47.
 
-The difference between corner-based ratio and Q1 field expels water from such skeletons in every step, however short.
-With a weight of 1 and eight cells over a beam's depth, its extreme pressures are 43 % off at nu = 0.49. At 0.499 they
-are six to thirty times too large, and adaptive steps never grow.
+The difference between corner-based ratio and Q1 field expels water from such skeletons in every step of any length.
+With a weight of 1 and eight cells over the depth, extreme pressures of a beam have errors of 43 % at nu = 0.49. At
+0.499 the pressures are six to thirty times too large, and adaptive steps never grow.
 """
 SHARE = 0.5
-"""Fraction of the deviation of the gradient from its cell mean that laws take in cells of flowing, dilatant soil.
+"""Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
 
-Dilatant flow with a volume rate of sin psi times its shear rate at four points over-constrains a Q1 cell, even with
-F-bar. A footing with associated flow, phi = 20 degrees, 9 and 17 cells over its width, then carries 4.4 and 3.4 % too
-much, and its load still rises. With one point a cell it carries 6.6 and 3.2 % too little, and flows.
+Dilatant flow has a volume strain rate of sin psi times its shear rate. At four points it over-constrains a Q1 cell,
+even with F-bar. For a footing with associated flow, phi = 20 degrees, on 9 and 17 cells, the load is then 4.4 and 3.4 %
+too large, and still rises. With one point per cell it is 6.6 and 3.2 % too small, and constant.
 """
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return a material's weight of the corner-based volume ratio in cells at the start of a step."""
+    """Return the weight of the corner-based volume ratio in cells of a material at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
@@ -54,14 +54,14 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step; points of each part (`SceneMaterials.parts`); each part's rows among all points."""
+    """Integration points of a step; points of each part (`SceneMaterials.parts`); their indices among all points."""
 
     pieces: PointData
     parts: tuple[PointData, ...]
     rows: tuple[NDArray[np.int64] | slice, ...]
 
     def shape_gradients(self) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the points where laws evaluate them."""
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the points at which laws use them."""
         if self.parts[0] is self.pieces:
             return self.pieces.places.shape_gradients(slice(None))
         n, d = self.pieces.x.shape
@@ -73,9 +73,9 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Positions of the pieces of a cut; rows and positions of the pieces of each part.
+    """Positions of the pieces of the cut domains; indices and positions of the pieces of each part.
 
-    lever (m, d), m: vectors to the pieces from the centroid of the material in their cell, once they are known.
+    lever (m, d), m: vectors to the pieces from the centroid of the material in their cell; None until computed.
     """
 
     pieces: Places
@@ -84,43 +84,31 @@ class PiecePlaces:
 
 
 class QuadraturePoints:
-    """The pieces as integration points, with the fields of the scene's forms.
+    """Pieces of particle domains as integration points, with the fields of the scene's forms.
 
     Parameters
     ----------
-    grid
-        Background grid.
     scene, bodies
-        The materials of the scene, and all its bodies.
-    fluid
-        Pore fluid, if any.
+        The materials of the scene with its fluid, and all its bodies.
     weighs
-        Whether there is gravity.
+        Whether the scene has gravity.
     extended
-        Whether user-defined functions may use any data of the points.
+        Whether user-defined functions may use any data of the material points.
 
     Attributes
     ----------
     pieces
         The integration points.
     laws
-        Each law with its integration points, and whether it takes F-bar, see `SceneMaterials.parts`.
+        Each law with its integration points, and whether it uses F-bar, see `SceneMaterials.parts`.
     varies
         Whether mobilities change with the deformation.
     layered
         Whether the conductivity differs between points.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        scene: SceneMaterials,
-        bodies: Sequence[Body],
-        fluid: Fluid | None,
-        weighs: bool,
-        extended: bool,
-    ):
-        self._grid, self._fluid = grid, fluid
+    def __init__(self, scene: SceneMaterials, bodies: Sequence[Body], weighs: bool, extended: bool):
+        self._grid, self._fluid = grid, fluid = scene.grid, scene.fluid
         self._linear = LinearGradients(grid.comm, bodies) if scene.some_elastic else None
         self._scene = scene
         self._weighs = weighs
@@ -149,7 +137,7 @@ class QuadraturePoints:
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
 
     def places(self, cut: CutDomains) -> PiecePlaces:
-        """Return the positions of the pieces of a cut."""
+        """Return the positions of the pieces of cut domains."""
         pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, cut.hoop), []
         law_places = self._law_places(cut, pieces)
         if len(self.laws) > 1 or law_places is not pieces:
@@ -159,7 +147,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws take the gradient: shifted in flowing, dilatant soil, see `SHARE`."""
+        """Return the positions at which laws use the gradient: shifted in flowing, dilatant soil, see `SHARE`."""
         if not self._scene.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self._scene.dilating(cut.points))
@@ -176,7 +164,7 @@ class QuadraturePoints:
         return Places(self._grid, cut.cells, middle + share * (cut.x - middle), mixed)
 
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
-        """Return the integration points of a cut with all their data, from the present points."""
+        """Return the integration points of cut domains with all their data at the present state of the points."""
         within = self._gradients(cut, points) if self._linear is not None and cut.domains else {}
         even = {name: values for name, values in self._changing(points).items() if name not in within}
         fields = {**self._constant(cut, points), **{name: cut.to_cells(values) for name, values in even.items()}}
@@ -190,7 +178,7 @@ class QuadraturePoints:
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
             if ACROSS in fields:
                 fields[ACROSS] = np.cbrt(factor) * fields[ACROSS]
-            if self._weighs:  # the weight of a point does not depend on the cell's volume ratio
+            if self._weighs:  # the weight of a material point does not depend on the cell's volume ratio
                 fields["density"] = fields["density"] / factor
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
@@ -200,7 +188,7 @@ class QuadraturePoints:
         return QuadratureData(pieces, data, tuple(rows for rows, _ in places.parts))
 
     def _constant(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the constants of the materials at the integration points."""
+        """Return the material constants at the integration points."""
         values = tuple(points.data[name] for name in self._scene.field_names)
 
         def make() -> dict[str, NDArray[np.float64]]:
@@ -220,10 +208,10 @@ class QuadraturePoints:
         return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the point data that change from step to step."""
+        """Return the data of material points that change from step to step."""
         fields = {"F": points.F, **self._scene.state(points)}
         fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
-        if self._extended:  # fields of laws are known for all materials; in `data` they are zero at points of others
+        if self._extended:  # `_constant` has fields of laws for all materials; `data` only at points of their own
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:
             fields["storage"] = self._scene.storage(points)
@@ -234,7 +222,7 @@ class QuadraturePoints:
         return fields
 
     def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return F, and the out-of-plane stretch if laws take it, at the pieces of this process's points."""
+        """Return F at the pieces of this process's points, and the out-of-plane stretch if laws use it."""
         of_materials = self._scene.elastic(points), self._scene.soil_rows(points)
         if not self._scene.across:
             return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}
@@ -242,7 +230,7 @@ class QuadraturePoints:
         return dict(zip(("F", ACROSS), in_plane(F), strict=True))
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data that differ between pieces of one point, if user-defined functions may use them."""
+        """Return the data that differ between pieces of one material point, if user-defined functions use them."""
         fields = {}
         if self._extended or self.varies:
             fields["position"] = cut.pieces.x + cut.grid.base
@@ -251,13 +239,13 @@ class QuadraturePoints:
         return {name: cut.pieces_to_cells(values) for name, values in fields.items()}
 
     def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return a constant of the materials at the integration points (m,)."""
+        """Return a material constant at the integration points (m,)."""
         return cut.to_cells(self._scene.table(points, value))
 
     def mobility(
         self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
     ) -> NDArray[np.float64]:
-        """Return the mobility k / (rho_w g) at the integration points (m,), m^2/(Pa s), by a law at the present u."""
+        """Return the mobility k / (rho_w g) at the integration points (m,), m^2/(Pa s), at the present displacement."""
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
@@ -268,17 +256,17 @@ class QuadraturePoints:
         return self._scene
 
     def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the masses (n,), kg, of the points, pore fluid included."""
+        """Return the masses (n,), kg, of the material points, pore fluid included."""
         return self._scene.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return a key (m, 2) for each integration point; points with equal keys conduct alike."""
+        """Return a key (m, 2) for each integration point; equal keys mean equal conductivities."""
         return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta of the fixed-stress operator at the integration points, 1/Pa, before the scheme's factor.
+        """Return beta of the fixed-stress operator at the integration points, 1/Pa, without the scheme's factor.
 
-        of_fluid: return 1/K_w instead, with which the plain iteration converges for stiff skeletons only.
+        of_fluid: return 1/K_w instead of beta; the iteration then converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

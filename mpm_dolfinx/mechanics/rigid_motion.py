@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The rigid motion nearest to prescribed displacements: the initial guess of Newton's method for bodies that rotate.
+"""The rigid motion nearest to prescribed displacements: initial guess of Newton's method for bodies that rotate.
 
 A linearised rotation by an angle a causes a spurious stretch of a^2 / 2. Soil may yield at this stretch. Newton's
-method would then fail, however short the step.
+method would then fail in steps of any length.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.parallel.exchange import over_all
 
 TURNS = 1e-3
-"""Smallest rotation angle that counts, rad."""
+"""Smallest rotation that is used as an initial guess, rad."""
 MEETS = 0.1
 """Largest gap after a rotation, relative to the gap after the best translation."""
 ITERATIONS = 9
@@ -32,17 +32,17 @@ def rigid_motion(
     Parameters
     ----------
     comm
-        The processes; the call is collective.
+        The processes; all must call the function.
     holds
-        Rows of prescribed displacements: direction; gap along it, m; stiffness, which is the weight of the row.
+        Penalties of prescribed displacements: direction; gap along it, m; stiffness, the weight in the fit.
     x : (n, d), m
         The positions.
     counts : (m,)
-        Rows that count.
+        Penalties that are used.
 
     Returns
     -------
-    None for a pure translation, or if a translation meets the prescribed displacements nearly as well.
+    None for a pure translation, or if a translation fits the prescribed displacements nearly as well.
     """
     d = x.shape[1]
     e = holds["direction"]
@@ -56,7 +56,7 @@ def rigid_motion(
     shift = np.zeros(d)
     turn = Rotation.identity()
     size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
-    left = []  # sum of squared gaps: second entry without rotation, last entry with the nearest one
+    left = []  # sums of squared gaps: second entry for the best translation, last entry for the best rigid motion
     for iteration in range(ITERATIONS):
         turned = _apply(turn, arm)
         off = gap - np.einsum("nd,nd->n", e, shift + turned - arm)
@@ -77,9 +77,9 @@ def rigid_motion(
 def turned(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the rotation (d, d) nearest to the motion of weighted positions x (n, d) to `to`, m (Kabsch 1976).
+    """Return the rotation (d, d) nearest to a motion of weighted positions from x to `to`, m (Kabsch 1976).
 
-    The result is the identity for a negligible rotation, or for a poor fit. The call is collective.
+    x, to (n, d); the result is the identity for a negligible rotation or a poor fit. All processes must call it.
     """
     d = x.shape[1]
     sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))
@@ -95,13 +95,13 @@ def turned(
 
 
 def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rotated vectors (n, d); 2D vectors rotate in their plane."""
+    """Return rotated vectors (n, d); 2D vectors rotate in the plane."""
     d = x.shape[1]
     return x @ turn.as_matrix()[:d, :d].T
 
 
 def _spin(x: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the velocity of positions x (n, d) along directions e (n, d) for unit rotation rates about each axis."""
+    """Return the velocities at x (n, d) along directions e (n, d) for unit angular velocities about each axis."""
     if x.shape[1] == 2:
         return (x[:, :1] * e[:, 1:] - x[:, 1:] * e[:, :1]).copy()
     return np.cross(x, e)

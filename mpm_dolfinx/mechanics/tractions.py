@@ -2,9 +2,9 @@
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
 A traction, force per reference area, is int t . v dA on the reference faces. A pressure is -int p n . v da over the
-present area, with its tangent. The tangent is symmetric except for the boundary of the surface, whose edges dx
-contribute p/2 (v x du) . dx. This term vanishes where two surfaces of equal pressure meet. It also vanishes on a wall
-that fixes the normal component, because v, du and the edge lie in the wall.
+present area, with its tangent. The tangent is symmetric except for the edges dx of the surface, which contribute
+p/2 (v x du) . dx. This term vanishes where two surfaces of equal pressure meet. It also vanishes on a wall that fixes
+the normal component of v and du, because v, du and the edge lie in the wall.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides, in a stage.
+    """Loads of one kind on sides of the bodies, in a stage.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class SideLoads(Acting):
 
     @property
     def surfaces(self) -> list[Surface]:
-        """Faces of the loads."""
+        """Faces with the loads."""
         return [faces for _, faces in self._loads]
 
     def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
@@ -65,7 +65,7 @@ class SideLoads(Acting):
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
-        """Return the value of a load at time t (s) at the positions on its side."""
+        """Return the value of a load at time t, s; side: positions on its side, see `on_side`."""
         raise NotImplementedError
 
     def _on(
@@ -76,7 +76,7 @@ class SideLoads(Acting):
 
 
 class DeadForces:
-    """Forms of the work of point forces."""
+    """Form of the work of point forces."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, force=(grid.dim,))
@@ -89,7 +89,7 @@ class Tractions(SideLoads):
     conditions, title = (Traction,), "tractions"
 
     def placed(self, place: Place) -> Loads:
-        """Return the forces of the tractions on the surface."""
+        """Return the forces of the tractions at points of the sides."""
         (places, force), forms = self.forces(place), self._forms(DeadForces)
         return DeadLoads(forms.work, PointData(forms.points, places, np.ones(len(force)), {"force": force}))
 
@@ -106,7 +106,7 @@ class Tractions(SideLoads):
 
 
 class DeadLoads(Loads):
-    """Forces that do not depend on the displacement."""
+    """Nodal forces that do not depend on the displacement."""
 
     def __init__(self, work: PointForm, data: PointData):
         self._work, self.data = work, data
@@ -117,14 +117,14 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange of patch data to the owners of their cells, and their positions there."""
+    """Return the exchange of patch data with the processes that own the cells, and the positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.local(travel.send(cell)), travel.send(x))
 
 
 class PressureForms:
-    """Forms of pressures, from their force on the area at the start of the step: work, and minus its derivative."""
+    """Forms of pressures: nodal forces, and minus their derivative, from the force on the area at the step's start."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -179,14 +179,14 @@ class PressureLoads(Loads):
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether all surfaces of equal pressure are closed, or end on walls that fix their normal component.
+    """Return whether each surface of equal pressure is closed, or ends on walls that fix their normal component.
 
-    A surface counts as open where corners of faces lie on the edges of other faces.
+    A surface counts as open if corners of its faces lie on the edges of other faces.
 
     Parameters
     ----------
     free : (nodes, d)
-        Components that no wall fixes.
+        Which displacement components walls leave free.
     pressures
         Pressures and their faces.
     """
@@ -201,7 +201,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
 
 def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
-    """Return axis and position, m, of the walls that fix their normal component."""
+    """Return axis and position, m, of each wall that fixes its normal displacement component."""
     out = []
     for wall, (axis, end) in SIDES[grid.dim].items():
         if not over_all(grid.comm, int(free[grid.wall_nodes(wall), axis].sum())):
@@ -210,16 +210,16 @@ def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
 
 
 def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[Surface]) -> bool:
-    """Return whether every edge of the faces belongs to two of them, or lies in a fixed wall."""
+    """Return whether every edge of the faces belongs to two faces, or lies in a fixed wall."""
     x = np.concatenate([faces.places() for faces in surfaces])
     count, edges = x.shape[1], _EDGES[grid.dim]
     number = np.rint(
         (x.reshape(-1, grid.dim) - grid.lower) / (NEAR * grid.finest) + 1 / 3
-    )  # off the midpoint between two integers
+    )  # halfway positions between two integers are avoided
     _, corner = np.unique(number, axis=0, return_inverse=True)
     edge = np.sort(corner.reshape(-1, count)[:, edges].reshape(-1, edges.shape[1]), axis=1)
     x = x[:, edges].reshape(-1, edges.shape[1], grid.dim)
-    if grid.dim == 3:  # triangles have one corner twice
+    if grid.dim == 3:  # triangles have one corner twice, and so an edge of zero length
         real = edge[:, 0] != edge[:, 1]
         edge, x = edge[real], x[real]
     _, kind, often = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
@@ -231,4 +231,4 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
 
 
 _EDGES = {2: np.array([[0], [1]]), 3: np.array([[0, 1], [1, 3], [3, 2], [2, 0]])}
-"""Corners of each edge of a face; in 2D, ends of the face."""
+"""Indices of the two corners of each edge of a face in 3D; in 2D of the ends of a face."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""User-defined terms in the balance of momentum, in bodies and on sides: see `user_functions`."""
+"""User-defined terms in the balance of momentum, integrated over bodies and sides: see `user_functions`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.user_functions import compiling, term_of
 
 
 class OwnTerm(NamedTuple):
-    """A user-defined term: its definition, points, form, and the form's derivative with respect to u, None if zero."""
+    """A user-defined term: definition, integration points, form, and derivative with respect to u or None."""
 
     given: Callable | OnSide
     points: FormPoints
@@ -32,12 +32,12 @@ class OwnTerm(NamedTuple):
 
 
 class OwnTerms:
-    """The user-defined terms of a scene, for all of its stages.
+    """User-defined terms of a scene, for all of its stages.
 
     Parameters
     ----------
     terms
-        Functions, or functions on sides.
+        Functions for bodies, or `OnSide` with functions for sides.
     pieces
         All integration points.
     forms
@@ -57,7 +57,7 @@ class OwnTerms:
         self.symmetric = True
         self.holding = False
         self.rates = False
-        """Whether all tangents are symmetric; whether any term depends on u; whether any depends on the velocity."""
+        """Whether all tangents are symmetric; whether any term depends on u; whether any term depends on velocity."""
         u = forms.u
         more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
@@ -80,7 +80,7 @@ class OwnTerms:
 
 
 class OwnTermsOfStage(Acting):
-    """The terms in a stage, with the faces of terms on sides."""
+    """User-defined terms in a stage, with the faces of terms on sides."""
 
     title = "user-defined terms"
 
@@ -92,7 +92,7 @@ class OwnTermsOfStage(Acting):
 
     @property
     def surfaces(self) -> list[Surface]:
-        """Faces of the terms on sides."""
+        """Faces with terms."""
         return [faces for _, faces in self._terms if faces is not None]
 
     def placed(self, place: Place) -> Loads:
@@ -112,7 +112,7 @@ class OwnTermsOfStage(Acting):
 
 
 class OwnLoads(Loads):
-    """User-defined terms in a substep, with their points."""
+    """Nodal forces of user-defined terms in a substep, integrated over bodies and sides."""
 
     varies = True
 
@@ -122,7 +122,7 @@ class OwnLoads(Loads):
         self.linear = not self.holding
 
     def resists(self, b: NDArray[np.float64]) -> None:
-        """Add the terms at u."""
+        """Add the nodal forces of the terms at u."""
         for term, data in self._terms:
             term.form.assemble_vector(b, data)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The weight of the bodies, int rho g . v dV, and of the pore fluid that fills dilating pores in the step."""
+"""Weight of the bodies, int rho g . v dV, and of the pore fluid that flows into dilating pores in the step."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mpm_dolfinx.mechanics.tractions import DeadLoads
 
 
 class Weight(Acting):
-    """The weight in a scene.
+    """Weight in a scene.
 
     Parameters
     ----------
     pieces
-        All integration points; they carry `density`, kg/m^3, at the start of the step.
+        All integration points, with `density`, kg/m^3, at the start of the step.
     u
         Displacement increment of the step.
     gravity : (d,), m/s^2
@@ -42,7 +42,7 @@ class Weight(Acting):
         self._dead, self._taken_up = PointForm(pieces.density * pull * pieces.dx, pieces), None
         if fluid_density is not None:
             grown = ufl.det(pieces.increment(u)) - 1
-            if saturation is not None:  # `density` is that of saturated soil
+            if saturation is not None:  # `density` is that of soil with saturated pores
                 grown = saturation * grown - (1 - saturation) * pieces.pores
             grown = fem.Constant(pieces.grid.mesh, fluid_density) * grown
             self._taken_up = PointForm(-grown * pull * pieces.dx, pieces)
@@ -64,6 +64,6 @@ class WeightLoads(DeadLoads):
         self._taken_up = taken_up
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add minus the weight of the fluid that fills dilating pores at u."""
+        """Subtract the weight of the fluid that flows into dilating pores at u."""
         if self._taken_up is not None:
             self._taken_up.assemble_vector(b, self.data)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Several processes: exchange of array rows between cell owners, and messages."""
+"""Several processes: exchange of array entries between owners of cells, and messages."""

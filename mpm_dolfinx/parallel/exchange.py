@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Exchange of array rows between processes, with answers.
+"""Exchange of array rows between processes, and of answers to them.
 
-A row belongs to a cell (a cut subdomain, a corner, a loaded point), because the owner of a cell assembles its
-integrals.  A single process copies nothing.
+A row is the data of one piece of a particle domain, corner or loaded point.  It is sent to the process that owns its
+cell, which assembles the integrals of the cell.  A single process copies nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @dataclass
 class Traffic:
-    """Total exchanges from this process to others: transfers, non-empty messages, bytes."""
+    """Totals of exchanges from this process to others: transfers, non-empty messages, bytes."""
 
     transfers: int = 0
     messages: int = 0
@@ -33,14 +33,14 @@ traffic = Traffic()
 
 
 class Exchange:
-    """A fixed pattern of rows to ranks.
+    """A fixed assignment of array rows to processes, which can be used for several transfers.
 
     Parameters
     ----------
     comm
         Processes of the exchange.
     destination : (n,)
-        Target rank of each row.
+        Rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
@@ -52,21 +52,21 @@ class Exchange:
         received, first_there = np.empty_like(sent), np.empty_like(sent)
         comm.Alltoall(sent, received)
         comm.Alltoall((np.cumsum(received) - received).astype(np.int32), first_there)
-        place = np.empty(len(destination), dtype=np.int32)  # index of each row among the rows its rank receives
+        place = np.empty(len(destination), dtype=np.int32)  # index of each row among all rows its process receives
         place[order] = np.arange(len(destination)) + np.repeat(first_there - (np.cumsum(sent) - sent), sent)
         self._counts = len(destination), int(received.sum())
         self._away = tuple(np.delete(counts, comm.rank) for counts in (sent, received))
-        self._sf = PETSc.SF().create(comm)  # sends to neighbours only
+        self._sf = PETSc.SF().create(comm)  # communicates only with processes that receive rows
         self._sf.setGraph(self._counts[1], None, np.column_stack([destination, place]).astype(PETSc.IntType))
 
     def send(self, rows: NDArray) -> NDArray:
-        """Return the rows received by this rank, ordered by sender."""
+        """Return the rows that this process receives, ordered by sender."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Return answers, one a received row, to the senders in their order."""
+        """Send back one answer for each received row; return the answers to this process, in the order it sent."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -75,7 +75,7 @@ class Exchange:
         rows = np.ascontiguousarray(rows)
         out = np.empty((self._counts[to], *rows.shape[1:]), dtype=rows.dtype)
         width = int(np.prod(rows.shape[1:], dtype=int))
-        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # counts of entries may exceed an int
+        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # entries may be more than an int counts
         away = self._away[1 - to]
         traffic.transfers += 1
         traffic.messages += int(np.count_nonzero(away))
@@ -87,7 +87,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the sum, or another reduction by `op`, of all processes' values; arrays entry by entry."""
+    """Return the sum over all processes of a value, or another reduction `op`; arrays are reduced entry by entry."""
     if comm.size == 1:
         return value
     if not isinstance(value, np.ndarray):
@@ -103,12 +103,12 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def first(comm: MPI.Intracomm, message: str) -> str:
-    """Return the first non-empty message of all processes, so that all raise the error of one."""
+    """Return the first non-empty message of all processes, so that all can raise the same error."""
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of `action` on rank 0 on every process; all raise its exception."""
+    """Return on every process the result of `action` on rank 0; if `action` raises, all processes raise its error."""
     value = error = None
     if comm.rank == 0:
         try:

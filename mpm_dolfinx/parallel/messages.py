@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Messages of the package, issued once for all processes: log lines and warnings."""
+"""Messages of the package, given once for all processes: log lines and warnings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages whose frames are skipped to find the script's line for a warning."""
+"""Packages with frames that are not a user's script: a warning names the line of the script."""
 
 
 class ResultWarning(UserWarning):
@@ -22,17 +22,17 @@ class ResultWarning(UserWarning):
 
 
 class ResolutionWarning(ResultWarning):
-    """Grid, points or steps are too coarse."""
+    """Warning that the grid, the material points or the time steps are too coarse."""
 
 
 class ConditionWarning(ResultWarning):
-    """Conditions, units, initial stresses or options contradict each other, or have no effect."""
+    """Warning that conditions, units, initial stresses or options contradict each other or have no effect."""
 
 
 def set_log_level(level: int | str) -> None:
-    """Show log lines of runs from a level on, such as "INFO" for step cuts and checkpoints.
+    """Show log lines of runs at and above a level, such as "INFO" for reduced steps and checkpoints.
 
-    Lines go to stderr, unless `logging` has handlers already.
+    Lines go to stderr, unless `logging` already has handlers.
 
     Parameters
     ----------
@@ -42,12 +42,12 @@ def set_log_level(level: int | str) -> None:
     Raises
     ------
     ValueError
-        Unknown level.
+        The level is unknown.
     """
     try:
         logger.setLevel(level)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"level = {level!r}, must be one of logging's, such as 'INFO'") from error
+        raise ValueError(f"level = {level!r}, must be a level of logging, such as 'INFO'") from error
     if not logger.hasHandlers():
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("mpm_dolfinx: %(message)s"))
@@ -61,10 +61,10 @@ def log(comm: MPI.Intracomm, message: str, *values, level: int = logging.INFO) -
 
 
 def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *values) -> None:
-    """Issue a warning on the first process, at the line of the script that led to it.
+    """Give a warning on the first process, at the line of the script that caused it.
 
-    All processes call this together.  If a filter turns the warning into an error, all of them raise it.  A caller must
-    therefore warn before it changes anything.
+    All processes must call it.  If a filter turns the warning into an error, all processes raise it.  A caller must
+    therefore warn before it changes any data.
     """
     raised = None
     if comm.rank == 0:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Material points, the cutting of their particle domains by the grid, and connected parts of the bodies."""
+"""Material points, pieces of their particle domains in the cells, and connected parts of the bodies."""

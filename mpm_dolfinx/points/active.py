@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Active part of a grid: a step only touches cells with material, for any size of the box."""
+"""Active cells of a grid: a step computes only cells with material, in a box of any size."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mpm_dolfinx.points.parts import parts_of_cells
 
 @dataclass(frozen=True, eq=False)
 class ActiveSet:
-    """The active cells of a grid, and all that follows from them.
+    """The active cells of a grid, and quantities derived from them.
 
-    cells, nodes: local numbers, ascending, ghosts included: active cells, and nodes of active cells of any process.
+    cells, nodes: local numbers of active cells and of nodes of active cells on any process; ascending, with ghosts.
     """
 
     grid: Grid
@@ -45,12 +45,12 @@ class ActiveSet:
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Connected part (cells,) of each local cell, from 1, 0 for empty ones; and the number of parts."""
+        """Connected part (cells,) of each local cell, from 1, 0 for empty cells; and the number of parts."""
         return parts_of_cells(self.grid, self.contains)
 
 
 class Active:
-    """The cells with material since the last grid reset, and their nodes.
+    """The cells with material since the last reset of the grid, and their nodes.
 
     Parameters
     ----------
@@ -59,17 +59,16 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Local arrays by cells, and by unrolled degrees of freedom, that are zero outside the active part.
+        Local arrays for cells and for unrolled degrees of freedom; they are zero outside active cells.
 
     Attributes
     ----------
     now
-        The active set, one object while the cells stay the same.
+        The active set; the same object while the cells are the same.
     slot : (cells,)
-        Index of each cell among the owned active ones.
+        Index of each cell among the owned active cells.
     centroid, opening : (cells, d), (cells, d, 2)
-        Offsets of the material's centroids from the cells' midpoints, m; open fractions of faces.  Empty without fluid,
-        like `slot`.
+        Offsets of the material's centroids from the cells' midpoints, m; open fractions of faces.  Empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):
@@ -83,11 +82,11 @@ class Active:
         self._of_dofs = tuple(dofs)
 
     def clear(self) -> None:
-        """Reset the arrays to zero, before other cells become active."""
+        """Reset the arrays to zero; called before other cells become active."""
         for rows, arrays in ((self.now.cells, self._of_cells), (self.now.dofs, self._of_dofs)):
             for values in arrays:
                 values[rows] = 0.0
 
     def set(self, cells: NDArray[np.int64], nodes: Callable[[], NDArray[np.int64]]) -> None:
-        """Set the active cells; nodes: function that returns their nodes.  The call is collective."""
+        """Set the active cells; nodes: function that returns their nodes.  All processes must call it."""
         self.now = self._last(cells, lambda: ActiveSet(self._grid, cells, nodes()), self._grid.comm)

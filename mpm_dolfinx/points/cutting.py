@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Particle domains, cut by the grid into pieces: the subdomains that lie in one cell each.
+"""Particle domains cut by the grid into pieces: the parts of a domain in one cell each.
 
-A point represents a quadrilateral or hexahedron with tracked corners. Its pieces have exact volumes and centroids, in
-3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear. One row of
-integration data for each piece therefore integrates them exactly, at any position of the points on the grid.
+A material point has a quadrilateral or hexahedral domain with tracked corners. Its pieces have exact volumes and
+centroids, in 3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear.
+One quadrature point per piece therefore integrates these gradients exactly, wherever the domain lies on the grid.
 
-The surface of a domain has 4 edges, or 4 triangles about the middle of each face in 3D. The triangles match the
-neighbours' and prefer no diagonal. The grid planes of one axis after the other slice this surface. Gauss's theorem
-gives volumes and first moments of the body between a slice and the lower face of its cell, and of the column of cells
-below. The interior of a domain is never cut, and the faces of the pieces follow at no cost.
+The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face. The triangles match the
+neighbours' and prefer no diagonal. The grid planes, axis by axis, slice this surface. Gauss's theorem gives volumes and
+first moments, from a slice to the lower face of its cell, and in the column of cells below. The interior of a domain is
+never cut, and the faces of the pieces follow at no cost.
 
-In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with r_c the radius of the area's centroid
-(Pappus). Gradients are evaluated at the volume's centroid, (mean r^2 / r_c, mean r z / r_c). The mean over the area
-gives u_r / r as (mean u_r) / r_c. The nodal forces of uniform stresses are then exact.
+In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
+(Pappus). Gradients are evaluated at the volume's centroid, (mean r^2 / r_c, mean r z / r_c). The hoop strain u_r / r is
+(mean u_r over the area) / r_c. The nodal forces of uniform stresses are then exact.
 """
 
 from __future__ import annotations
@@ -30,21 +30,22 @@ from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
-CHUNK = 2**15  # simplices cut at a time, for the processor's cache
-TANGLED = 0.2  # volume spanned by the corners over the domain's: below it corners are re-initialised from F
+CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
+TANGLED = 0.2  # volume between the corners / volume of the domain; below it corners are re-initialised from F
 
 
 @dataclass
 class Pieces:
-    """Particle domains cut by the cells; arrays over the pieces, ordered by point and cell.
+    """Pieces of particle domains; arrays for m pieces, ordered by point and cell.
 
-    point : (m,) index of the domain; cell : (m,) lexicographic number of the cell; fraction : (m,) fraction of the
-    domain's volume; x : (m, d) centroid, m; faces : (m, d, 2) area of the piece on the lower and upper face of its
-    cell, m^(d-1); mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other
-    axes, m^2; hoop : (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's
-    midpoint, m; mean product of its components, m^2; radius of this centroid, m; second : (m, d, d) on request, else
-    (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces that are symmetric in the
-    plane.
+    point (m,): index of the domain; cell (m,): lexicographic number of the cell.
+    fraction (m,): volume / volume of the domain; x (m, d): centroid, m.
+    faces (m, d, 2) on request, else (m, 0, 2): area of the piece on the lower and upper face of its cell along each
+    axis, m^(d-1).
+    mixed (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2.
+    hoop (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
+    product of its components, m^2; radius of this centroid, m.
+    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; of symmetric rings.
     """
 
     point: NDArray[np.int64]
@@ -58,35 +59,35 @@ class Pieces:
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the ends (2^d, d) of the corners of a domain along each axis: 0 lower, 1 upper."""
+    """Return the ends (2^d, d) of the domain's corners along each axis: 0 lower, 1 upper."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
 def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the corners (2d, 2^(d-1)) of a domain's faces; face 2 a + e is at end e of axis a."""
+    """Return the indices (2d, 2^(d-1)) of the corners of a domain's faces; face 2 a + e is at end e of axis a."""
     bits = corner_bits(dim)
     return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
 
 FACES = {d: _faces(d) for d in (2, 3)}
-"""Corners (2d, 2^(d-1)) of the faces of a domain."""
+"""Indices (2d, 2^(d-1)) of the corners of a domain's faces."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of the faces by the order of their corners: 1 outward, -1 inward; the first four in 2D."""
+"""Orientation (6,) of the faces with corners in this order: 1 outward, -1 inward; the first four in 2D."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
 
 @cache
 def kuhn_simplices(dim: int) -> NDArray[np.int64]:
-    """Return the corners (d!, d+1) of Kuhn's simplices of a domain or face."""
+    """Return the indices (d!, d+1) of the corners of Kuhn's simplices of a domain or face."""
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])
 
 
 @cache
 def simplices(dim: int) -> NDArray[np.int64]:
-    """Return the `vertices` (4 or 24, d+1) of the simplices of a domain: facets of its surface, and its middle.
+    """Return the vertices (4 or 24, d+1), as numbered by `vertices`, of the simplices of a domain.
 
-    The set is invariant under all rotations and mirrors of the domain; the facets look outward.
+    A simplex is a facet of the surface, oriented outward, and the middle.  Rotations and mirrors preserve the set.
     """
     rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
     facets = []
@@ -100,13 +101,13 @@ def simplices(dim: int) -> NDArray[np.int64]:
 
 
 def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners of domains (2^d, d, n), in 3D the middles of their faces, and last their middles."""
+    """Return the corners of domains y (2^d, d, n), in 3D also the middles of their faces, and last their middles."""
     faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
     return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains with these vertices (v, d, n)."""
+    """Return the signed volumes (k, n) of the simplices of domains; v (v, d, n): the result of `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
@@ -115,9 +116,9 @@ def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative for inverted ones.
+    """Return the volumes (n,), m^d, of domains with corners (n, 2^d, d); negative for inverted domains.
 
-    In 3D the sum runs over faces: a third of the product of each face's middle and area vector.
+    In 3D each face contributes a third of the product of its middle and its area vector.
     """
     y = np.ascontiguousarray((corners - corners[:, :1]).transpose(1, 2, 0))
     if len(y) == 4:
@@ -140,7 +141,7 @@ def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains (n, 2^d, d); in axisymmetry the volumes of their rings, m^3."""
+    """Return the volumes (n,), m^d, of domains with corners (n, 2^d, d); in axisymmetry of their rings, m^3."""
     if not axisymmetric:
         return volumes(corners)
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
@@ -148,13 +149,13 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
 
 
 def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), as columns."""
+    """Return the mean edges (n, d, d), m, as columns, of domains with corners (n, 2^d, d)."""
     signs = 2.0 * corner_bits(corners.shape[2]) - 1
     return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centroids (n, d), m, of domains (n, 2^d, d), in axisymmetry the centroids of their sections.
+    """Return the centroids (n, d), m, of domains with corners (n, 2^d, d); in axisymmetry of their sections.
 
     As in `cut`, inverted simplices count with positive volume.
     """
@@ -171,7 +172,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return the inverted domains (n, 2^d, d): their corners span far less, or more, than their volume (n,)."""
+    """Return which domains are inverted: the volume between their corners is far below, or above, their volume (n,)."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -179,7 +180,7 @@ def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmet
 def parallelepipeds(
     x: NDArray[np.float64], F: NDArray[np.float64], spacing: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), m, of boxes of size `spacing` (n, d) at x (n, d), deformed by F (n, d, d)."""
+    """Return the corners (n, 2^d, d), m, of boxes with edges `spacing` (n, d), at x (n, d), deformed by F (n, d, d)."""
     offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
 
@@ -190,22 +191,22 @@ def _chunks(count: int, dim: int) -> list[slice]:
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
 
-def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Pieces:
+def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
-        Corners of the domains, inside the grid; corner k has the ends `corner_bits(d)[k]`.
-    second
-        Whether to compute second moments of the pieces.
+        Corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
+    second, faces
+        Whether to compute second moments and face areas of the pieces.
 
     Returns
     -------
-    The pieces, without slivers below 1e-12 of their domain; fractions sum to one for every domain.
+    The pieces.  Pieces below 1e-12 of their domain are left out; the fractions of every domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
-    parts = [_cut(grid, corners[chunk], second) for chunk in chunks]
+    parts = [_cut(grid, corners[chunk], second, faces) for chunk in chunks]
     for chunk, part in zip(chunks, parts, strict=True):
         part.point += chunk.start
     columns = zip(*([getattr(part, f.name) for f in fields(Pieces)] for part in parts), strict=True)
@@ -215,15 +216,14 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Piece
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in cells from the grid's lower corner, and positions for slicing, both snapped to nearby planes.
+    """Return positions in cells and positions for slicing, both snapped to grid planes nearer than `Grid.snap`.
 
-    Edges of domains are straight in metres. On equal cells the positions for slicing are in cells, else in m from the
-    base.
+    Edges of domains are straight in metres. On equal cells the positions for slicing are in cells, else in metres.
 
     Parameters
     ----------
-    true, x
-        The positions in cells and, from the base, in m; components along the axis number `axes`.
+    true, x, axes
+        Positions from the grid's lower corner, in cells; positions from the base, m; array axis of the components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -237,7 +237,7 @@ def on_planes(
 
 
 def slices_in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return slices (d, k, m), each in one cell, with positions for slicing turned into cells from the lower corner."""
+    """Return slices (d, k, m), each in one cell, as positions in cells from the grid's lower corner."""
     if grid.even:
         return s
     out = s.copy()
@@ -247,14 +247,14 @@ def slices_in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
+def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) -> Pieces:
     d, true = grid.dim, np.ascontiguousarray(grid.in_cells(corners).transpose(1, 2, 0))
     x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
     in_cells, y = on_planes(grid, true, x, 1)
     v = vertices(y)
     volume = simplex_volumes(v)
     flat = (~volume.any(axis=0)).nonzero()[0]
-    if len(flat):  # thinner than the snapping distance and on a plane: snapping would leave no volume
+    if len(flat):  # domains on a plane and thinner than the snapping distance: snapping would leave no volume
         in_cells[:, :, flat] = true[:, :, flat]
         y[:, :, flat] = x[:, :, flat]
         v = vertices(y)
@@ -274,12 +274,12 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
         s, facet = sliced(s, facet, axis, grid)
     s = slices_in_cells(grid, s)
     area = _area_vectors(s)
-    area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has changed the order of vertices
-    return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second)
+    area *= np.sign((area * outward.take(facet, axis=1)).sum(axis=0))  # slicing has changed the order of vertices
+    return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second, faces)
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the normals (d, m) of segments or triangles (d, d, m); their length is the size."""
+    """Return the normals (d, m) of segments or triangles (d, d, m), with their length or area as norm."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.array([e[0, 1], -e[0, 0]])
@@ -290,7 +290,7 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 def _facets(dim: int) -> NDArray[np.int64]:
     """Return the vertices (k, d+1, d) of the facets of a domain's simplices, oriented outward.
 
-    The k-th facet lacks the k-th vertex; the last facets, which lack the middle, are the domain's surface.
+    The i-th facet of a simplex omits its i-th vertex.  The last facets omit the middle: they form the surface.
     """
     out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
     box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
@@ -303,7 +303,7 @@ def _facets(dim: int) -> NDArray[np.int64]:
 
 
 class _Slots:
-    """Cells in the bounding boxes of domains: one slot for each domain and cell, with the last axis fastest."""
+    """Cells in the bounding boxes of domains: one slot for each domain and cell; the last axis varies fastest."""
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
@@ -320,12 +320,15 @@ class _Slots:
         self.cell = self.low[:, self.point] + self._place
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the slots (m,) of domains and cells (d, m)."""
-        place = index.astype(np.int64) - self.low[:, owner]
-        return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
+        """Return the slots (m,) of cells with indices (d, m), for the domains `owner` (m,)."""
+        before = self._start - (self.low * self._stride).sum(axis=0)
+        out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
+        for place, stride in zip(index[:-1], self._stride, strict=False):
+            out += place.astype(np.int64) * stride.take(owner)
+        return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return the sums of the slots' values over the cells further along an axis in the same column."""
+        """Return, for each slot, the sum of the values of the slots further along an axis in the same column."""
         out = np.zeros(self.size)
         for steps in range(1, int(self._span[axis].max(initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -340,18 +343,19 @@ def _sum(
     area: NDArray[np.float64],
     owner: NDArray[np.int64],
     second: bool,
+    faces: bool,
 ) -> Pieces:
-    """Sum the surfaces' slices to one piece for each point and cell."""
+    """Sum the slices of the surfaces to one piece for each domain and cell."""
     d = grid.dim
     index = np.floor(s.sum(axis=0) / d)
     least = s.min(axis=0)
     most = s.max(axis=0)
     ends = []
     for a in range(d):
-        # a slice on a grid plane belongs to the cell of the body behind it
+        # a slice on a grid plane belongs to the cell that contains the body
         index[a] -= (area[a] > 0) & (most[a] == index[a])
-        np.minimum(np.maximum(index[a], slots.low[a][owner]), slots.high[a][owner], out=index[a])
-        flat = most[a] - least[a] < grid.snap[a]  # rounding may snap one of two touching domains only: hence twice
+        np.minimum(np.maximum(index[a], slots.low[a].take(owner)), slots.high[a].take(owner), out=index[a])
+        flat = most[a] - least[a] < grid.snap[a]  # rounding may snap only one of two touching domains: factor 2 below
         lower = (flat & (area[a] < 0) & (most[a] - index[a] < 2 * grid.snap[a])).nonzero()[0]
         upper = (flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * grid.snap[a])).nonzero()[0]
         ends.append((lower, upper))
@@ -360,7 +364,7 @@ def _sum(
     def total(values, chosen=slice(None)):
         return sum_by(slot[chosen], values[chosen], slots.size)
 
-    # integrals over the slices of (x, x^2/2, xy, xz) n_x from the cell's lower face, and over the columns beyond
+    # integrals of (x, x^2/2, xy, xz) n_x over the slices, from the cell's lower face, and over the columns beyond
     x = s - index
 
     @cache
@@ -383,7 +387,7 @@ def _sum(
     size = volume if grid.even else volume * grid.widths_of(slots.cell.T).prod(axis=1)
     whole = sum_by(slots.point, size, len(slots.low[0]))[slots.point]
     kept = (size / whole > SLIVER).nonzero()[0]
-    point, cell = slots.point[kept], slots.cell[:, kept].T
+    point, cell = slots.point[kept], slots.cell.take(kept, axis=1).T
     h = grid.widths_of(cell).T  # (d, m), or of equal cells (d,)
     if grid.axisymmetric:
         x0, x1 = x[:, 0]
@@ -393,26 +397,25 @@ def _sum(
         products += slots.beyond(total(area[0] * sums[1] / 2), 0) / 2
         r = s[:, 0].mean(axis=0)
         if grid.even:
-            area[1] *= grid.low[0] + grid.h[0] * r  # sections across the axis are rings too
+            area[1] *= grid.low[0] + grid.h[0] * r  # sections normal to the axis of revolution are rings too
         else:
             area[1] *= grid.lines[0][index[0].astype(int)] + grid.widths[0][index[0].astype(int)] * (r - index[0])
-    faces = np.empty((len(kept), d, 2))
-    for a in range(d):
+    sections = np.empty((d * faces, 2, len(kept)))
+    for a, section in enumerate(sections):
         shadow = total(area[a]) if a else shadow
         beyond = slots.beyond(shadow, a)
         lower, upper = (total(area[a], chosen) for chosen in ends[a])
-        # the section of the body just above the lower and just below the upper face
-        faces[:, a] = np.array([beyond + shadow - lower, beyond + upper]).T[kept]
-        faces[:, a] *= grid.cell_volume / h[a] if grid.even else (h.prod(axis=0) / h[a])[:, None]
+        # areas of the body's sections just above the lower and just below the upper face
+        np.multiply([(beyond + shadow - lower)[kept], (beyond + upper)[kept]], h.prod(axis=0) / h[a], out=section)
 
-    # centroids stay off the grid lines, and inside the cell that they belong to
+    # centroids are kept away from grid lines, inside the cell of the piece
     volume = volume[kept]
     hoop = np.empty((len(kept), 0))
     spread = np.zeros((len(kept), d, d))
     middle = np.array([m[kept] / volume for m in moments]).T.copy()
     centroid = np.minimum(np.maximum(middle, grid.snap), 1 - grid.snap)
     for (a, b), product in zip(pairs, uneven, strict=True):
-        # rounding may spoil it for very thin pieces: clip to its exact range
+        # rounding may spoil the mean in very thin pieces: it is clipped to its exact range
         mean = np.minimum(
             np.maximum(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25), 0.25
         )
@@ -422,8 +425,9 @@ def _sum(
     )
     if grid.axisymmetric:
         ends = cell[:, [0]] + [0, 1]
-        faces[:, 0] *= TURN * (grid.low[0] + grid.h[0] * ends if grid.even else grid.lines[0][ends])
-        faces[:, 1] *= TURN
+        if faces:
+            sections[0] *= TURN * (grid.low[0] + grid.h[0] * ends if grid.even else grid.lines[0][ends]).T
+            sections[1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
         volume = volume * radius if grid.even else volume * h.prod(axis=0) * radius
         spread = of_rings(spread, hoop[:, 3])
@@ -431,11 +435,12 @@ def _sum(
         volume = volume * h.prod(axis=0)
     fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.places(cell, centroid)
     moments = spread if second else np.empty((len(kept), 0))
-    return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop, moments)
+    areas = np.ascontiguousarray(np.abs(sections).transpose(2, 0, 1))
+    return Pieces(point, grid.number(cell), fraction, x, areas, mixed, hoop, moments)
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return (second moments) / volume (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
+    """Return (second moments about the centroid) / volume of domains (n, d, d), m^2, exact for parallelepipeds.
 
     rings: whether the domains are sections of rings, in axisymmetry.
     """
@@ -445,10 +450,10 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (second moments) / volume (n, 2, 2), m^2, of rings about their centroids, from symmetric sections.
+    """Return (second moments about the centroid) / volume of rings (n, 2, 2), m^2, for symmetric sections.
 
-    spread (n, 2, 2): second moments of the sections, m^2; radius (n,): radius of their centroids, m; spread[:, 0] /
-    radius is the vector from the section's centroid to the ring's centroid.
+    spread (n, 2, 2): second moments / area of the sections, m^2; radius (n,): radius of the sections' centroids, m.
+    The vector from a section's centroid to the ring's centroid is spread[:, 0] / radius.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -457,12 +462,12 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 def _rings(
     grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return radii (m,), m, centroids of the volumes (m, 2) in their cells, from 0 to 1, and `hoop` of pieces.
+    """Return radii (m,), m, volume centroids (m, 2), from 0 to 1 in their cells, and `hoop` of pieces, see `Pieces`.
 
-    cell (m, 2): indices; c (m, 2): centroids in the plane, from 0 to 1; squares, products (m,): means of r^2 and r z.
+    cell (m, 2): indices; c (m, 2): area centroids, from 0 to 1; squares, products (m,): means of r^2 and r z.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
-    squares = np.minimum(np.maximum(squares, x**2), x)  # slivers may lose them in rounding
+    squares = np.minimum(np.maximum(squares, x**2), x)  # rounding may violate these bounds in very thin pieces
     products = np.minimum(np.maximum(products, np.maximum(0.0, x + z - 1)), np.minimum(x, z))
     inner = grid.low[0] + h * cell[:, 0] if grid.even else grid.lines[0][cell[:, 0]]
     radius = inner + h * x
@@ -481,22 +486,22 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals, over the pieces of slots, of products of two coordinates from the corners of their cells.
+    """Return the integrals over the pieces of products of two coordinates, from the lower corners of their cells.
 
     Parameters
     ----------
     pairs
-        Axes of the coordinates, ascending.
+        Axes of the two coordinates, ascending.
     x, sums, area
-        Vertices (d, d, m) of slices, their sums (d, m), and the areas (m,) of the slices, projected along the first
+        Vertices (d, d, m) of slices, their sums (d, m), and the areas (m,) of the slices projected along the first
         axis.
     pair, total
-        Functions: sum of products of two coordinates over vertices of slices; sum of slices' values over slots.
+        Functions: sum over the vertices of slices of the product of two coordinates; sum of slice values in each slot.
     """
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return the integrals of a product of up to three coordinates over the slices."""
+        """Return the integrals over the slices of a product of up to three coordinates."""
         if not factors:
             return area
         if len(factors) == 1:
@@ -521,20 +526,20 @@ def cut_faces(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cut faces of domains by the grid; return integration points, exact for products of Q1 functions.
 
-    A face that crosses a grid line must load the nodes on both sides in proportion to its parts. With one point a face,
-    the error moves nodes of partly filled cells in every step, without end.
+    A face across a grid line must load the nodes on both sides in proportion to its parts. With one point per face, the
+    error would move nodes of partly filled cells in every step without limit.
 
     Parameters
     ----------
     corners : (m, 2^(d-1), d), m
-        Corners of the faces; triangles repeat the last one.
+        Corners of the faces; triangles repeat their last corner.
     local : (m, 2^(d-1), e)
-        Coordinates of the corners for interpolation.
+        Coordinates of the corners, to be interpolated.
 
     Returns
     -------
-    Face (n,), position (n, d), local coordinates (n, e) and fraction of the face (n,) of each point; middle (n, d) of
-    the part of the face in its cell.
+    Face (n,), position (n, d), interpolated coordinates (n, e) and fraction of the face (n,) of each point; middle (n,
+    d) of the face's part in the cell of the point.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -545,23 +550,23 @@ def cut_faces(
         both, split = np.concatenate([both, np.where(three, both[2], both.sum(axis=0) / 4)[None]]), ABOUT_MIDDLE
     whole = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
     count = whole.shape[2]
-    # sizes follow from local coordinates, which are never degenerate; a triangle is half of a face
+    # sizes are computed from local coordinates, which are never degenerate; a triangle is half of a face
     size = _size(whole[:, d:]).reshape(len(split), m)
     share = (size / size.sum(axis=0)).ravel()
-    s = np.concatenate([whole, np.eye(d)[:, :, None].repeat(count, axis=2)], axis=1)  # and barycentric coordinates
+    s = np.concatenate([whole, np.eye(d)[:, :, None].repeat(count, axis=2)], axis=1)  # last: barycentric coordinates
     owner = np.arange(count)
     for axis in range(d):
         s, owner = sliced(s, owner, axis, grid)
-    kept = (_size(s[:, -d:-1]) * share[owner] > SLIVER).nonzero()[0]  # drop slices that only touch a plane
+    kept = (_size(s[:, -d:-1]) * share[owner] > SLIVER).nonzero()[0]  # slices that only touch a plane are left out
     s, owner = s[:, :, kept], owner[kept]
     if d == 3:
         s, owner = _polygons(grid, s, owner)
     share = _size(s[:, -d:-1]) * share[owner]
     s, owner = s[:, :-d], owner % max(1, m)
-    share /= sum_by(owner, share, m)[owner]  # dropped slivers must not reduce a face
+    share /= sum_by(owner, share, m)[owner]  # slices left out must not reduce a face
 
     def place(y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions (n, d), m, from the base."""
+        """Return positions (n, d), m, relative to the base."""
         return grid.low + grid.h * y if grid.even else y
 
     points = np.einsum("qk,kam->qam", _RULES[d], s)
@@ -577,14 +582,14 @@ def _polygons(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the parts of cut triangles as triangles that do not depend on the order of the axes.
 
-    The slices of a triangle in one cell form a convex polygon. It is split about the mean of its corners.
+    The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
     Parameters
     ----------
     s : (3, a, n)
-        Corners of the slices: positions for slicing first, and last their barycentric coordinates in the triangle.
+        Corners of the slices: first positions for slicing, last barycentric coordinates in the triangle.
     owner : (n,)
-        Triangle of each slice.
+        Index of the triangle of each slice.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
@@ -593,7 +598,7 @@ def _polygons(
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
-    two = slice(-3, -1)  # two barycentric coordinates, which give areas
+    two = slice(-3, -1)  # two barycentric coordinates, from which areas are computed
     middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
     order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
     v, group = v[:, order], group[order]
@@ -621,14 +626,14 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the next member (n,) of each group, cyclically; groups (n,) are in order."""
+    """Return the next member (n,) of each member's group, cyclically; group (n,): group of each member, in order."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lengths of segments, or areas of triangles, (k+1, e, m), up to a factor."""
+    """Return lengths of segments or areas of triangles (k+1, e, m), without a constant factor."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.sqrt((e[0] ** 2).sum(axis=0))
@@ -644,7 +649,7 @@ _RULES = {  # Source: Gauss, Strang and Fix (1973); equal weights, exact to thir
 
 
 def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
-    """Slice simplices, in positions for slicing, by the grid planes of an axis until none crosses a plane."""
+    """Slice simplices, in positions for slicing, by the grid planes of an axis until no simplex crosses a plane."""
     done_s, done_owner = [], []
     while True:
         t = s[:, axis]
@@ -652,16 +657,16 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
         crossing = t.max(axis=0) > plane
         if not crossing.any():
             break
-        done_s.append(s[:, :, ~crossing])
+        done_s.append(s.compress(~crossing, axis=2))
         done_owner.append(owner[~crossing])
-        below, below_owner, s, owner = cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
+        below, below_owner, s, owner = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
         done_s.append(below)
         done_owner.append(below_owner)
     return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane; return the parts below and above with their owners."""
+    """Cut each simplex at a plane; return the parts below and above it with their owners."""
     order = s[:, axis].argsort(axis=0)
     s = np.take_along_axis(s, order[:, None], axis=0)
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
@@ -670,7 +675,7 @@ def cut_at(s, owner, axis: int, plane):
     owners = {"below": [owner[:0]], "above": [owner[:0]]}
     for k in range(1, dim + 1):
         chosen = (count == k).nonzero()[0]
-        v, c = s[:, :, chosen], plane[chosen]
+        v, c = s.take(chosen, axis=2), plane[chosen]
         points = {(i,): v[i] for i in range(dim + 1)}
         for i in range(k):
             for j in range(k, dim + 1):
@@ -687,7 +692,7 @@ def cut_at(s, owner, axis: int, plane):
 
 
 def _on_plane(a, b, axis: int, plane):
-    """Return the intersections of the edges from a to b with the plane, exactly on it."""
+    """Return the intersections of the edges from a to b with the plane, with the plane's exact coordinate."""
     t = (plane - a[axis]) / (b[axis] - a[axis])
     x = a + t * (b - a)
     x[axis] = plane
@@ -695,7 +700,7 @@ def _on_plane(a, b, axis: int, plane):
 
 
 _A, _B, _C = (0,), (1,), (2,)  # Source: definition, the vertices
-# vertices are sorted along the axis; (i, j) is the point where the edge from i to j meets the plane
+# vertices are sorted along the axis; (i, j) is the intersection of the edge from i to j with the plane
 _CUTS = {
     1: {1: {"below": [(_A, (0, 1))], "above": [((0, 1), _B)]}},
     2: {

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Values at given positions from polynomials fitted to data around them: moving least squares.
+"""Values at given positions from polynomials fitted to surrounding data: moving least squares.
 
-    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i the offsets from the position.
+    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i: offsets from the position.
 
-The constant of P is the value (Lancaster and Salkauskas 1981). Polynomials up to the degree are reproduced exactly. The
-weights fall smoothly to zero, so values are continuous as data enter and leave. The small terms set coefficients to
-zero that the data do not determine, the higher degrees first.
+The value is the constant of P (Lancaster and Salkauskas 1981). Polynomials up to the degree are reproduced exactly. The
+weights decrease smoothly to zero, so values are continuous when data enter or leave the fit. The small terms set
+coefficients to zero that the data do not determine, the higher degrees first.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 RADIUS = 3.0
-"""Offset, in spacings of the data, from which on the weight is zero.
+"""Offset beyond which the weight is zero, in spacings of the data.
 
 Source: exact, at an end of the data the points at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of each degree's coefficients relative to the data; they only affect undetermined coefficients.
+"""Weights of each degree's coefficients relative to the data's weight; they only affect undetermined coefficients.
 
 Factors of 0.01 and 100 change the pressures of a consolidating column by 1e-5 of the load.
 """
 
 
 def near(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights (r,) of data at offsets (r, d), in units of their spacing."""
+    """Return the weights (r,) of data at offsets (r, d), in spacings of the data."""
     return np.clip(1 - (offset / RADIUS) ** 2, 0, None).prod(axis=1) ** 4
 
 
 class LocalFit:
-    """Polynomials about given positions, fitted to the values of all processes.
+    """Polynomials about given positions, fitted to the data of all processes.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class LocalFit:
         self._sums, self._shape = np.zeros((count, size * (size + width))), (count, size, size + width)
 
     def add(self, at: NDArray[np.int64], offset: NDArray, values: NDArray, weight: NDArray) -> None:
-        """Add weighted values (r, width) for positions `at` (r,), at offsets (r, d) in units of the data's spacing."""
+        """Add weighted values (r, width) to the fits at positions `at` (r,); offset (r, d), in spacings of the data."""
         basis = np.stack([offset[:, list(p)].prod(axis=1) for p in self._powers], axis=1)
         rows = np.concatenate([basis, values], axis=1)
         outer = (weight[:, None] * basis)[:, :, None] * rows[:, None, :]
@@ -66,7 +66,7 @@ class LocalFit:
             self._sums[:, k] += sum_by(at, column, len(self._sums))
 
     def values(self, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the values (count, width) at the positions, on every process; zero without data."""
+        """Return the fitted values (count, width) at the positions, on every process; zero without data."""
         size = len(self._powers)
         sums = over_all(comm, self._sums).reshape(self._shape)
         A = sums[:, :, :size].copy()

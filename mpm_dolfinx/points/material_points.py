@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Material points: the state that a body keeps when the grid is reset.
+"""Material points: the state of the bodies, which a reset of the grid preserves.
 
-It has positions, corners of the particle domains, F, pore pressure, and `data` by name: state variables of laws, data
-of conditions and, with inertia, velocity and rate of F.
+The state consists of positions, corners of the particle domains, F, pore pressure, and `data` by name: state variables
+of laws, data of conditions and, with inertia, velocity and rate of F.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ ACROSS = "stretch across"
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the body (n,) of each point, from its id; starts (bodies + 1,): first id of each body and of new points.
 
-    Ids beyond the seeded ones are assigned to the bodies in turn.
+    Ids of new points are assigned to the bodies in turn.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F (n,) of F (n, d, d); numpy's function, by LU factors, takes twenty times as long."""
+    """Return det F (n,) of F (n, d, d); numpy's function uses LU factors and takes twenty times as long."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
@@ -50,7 +50,7 @@ def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return F (n, d, d), scaled to volume ratios J (n,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # inverted points are refused later
+    with np.errstate(divide="ignore", invalid="ignore"):  # inverted points are rejected later
         ratio = J / determinant(F)
     return F * (np.sign(ratio) * np.abs(ratio) ** (1 / F.shape[1]))[:, None, None]
 
@@ -72,7 +72,7 @@ def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return det F F^-T (n, d, d) of F (n, d, d); numpy's inverse takes ten times as long."""
     if F.shape[1] == 2:
-        flat = F.reshape(-1, 4)[:, [3, 2, 1, 0]] * [1.0, -1.0, -1.0, 1.0]
+        flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
     return np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
 
@@ -86,26 +86,26 @@ class MaterialPoints:
     Attributes
     ----------
     id : (n,)
-        Number of the point, in a scene unique over all bodies.
+        Number of the point, unique in a scene.
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `cutting.corner_bits`.
     F : (n, d, d)
-        Deformation gradient; with an out-of-plane stretch its in-plane part, scaled to det F.
+        Deformation gradient; in plane strain with an out-of-plane stretch only its in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: the mean over the domain, of second order. Cells and pieces have their
-        own.
+        Pore pressure, positive in compression: mean over the domain, second-order accurate. Cells and pieces have
+        their own pressures.
     x : (n, d), m
-        Centroid of the domain, in axisymmetry of its section: F and pressure of linear fields are exact there.
+        Centroid of the domain, in axisymmetry of its section: for linear fields, F and pressure are exact at it.
     origin : (n, 2^d, d), m
-        Corners at zero displacement: as seeded, or at the last reset by a stage.
+        Corners at zero displacement: as seeded, or at the last time a stage set displacements to zero.
     reference : (n, 2^d, d), m
         Corners of the domain in the reference configuration of F: as seeded, or as re-initialised.
     data : name -> (n, ...)
-        Further data of the points: parameters that vary in space, state of the law.
+        Further data of the points: parameters that vary with position, state of the law.
     """
 
     id: NDArray[np.int64]
@@ -128,11 +128,11 @@ class MaterialPoints:
         return type(self), (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
 
     def placed(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with true positions, from positions relative to a base (d,), m; base 0 returns `self`."""
+        """Return the points with true positions, from positions relative to `base` (d,), m; base 0 returns `self`."""
         return PlacedPoints(**self._moved(base)) if base.any() else self
 
     def _moved(self, by: NDArray[np.float64]) -> dict[str, Any]:
-        """Return the fields with all positions moved by (d,), m."""
+        """Return the fields with all positions translated by the vector `by` (d,), m."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         corners, x = self.corners + by, self.x + by
 
@@ -152,7 +152,7 @@ class MaterialPoints:
 
     @property
     def arrays(self) -> tuple[NDArray, ...]:
-        """All arrays."""
+        """All arrays of the points."""
         return (*_ARRAYS(self), *self.data.values())
 
     def __len__(self) -> int:
@@ -165,11 +165,11 @@ class MaterialPoints:
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:
-        """Deformation gradient of the laws (n, 3, 3); in plane strain without an out-of-plane stretch (n, 2, 2)."""
+        """Deformation gradient used by laws (n, 3, 3); in plane strain without an out-of-plane stretch (n, 2, 2)."""
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
     def strained(self, F: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with another deformation gradient, of the shape of `F_of_laws`."""
+        """Return the points with another deformation gradient F, in the shape of `F_of_laws`."""
         if ACROSS not in self.data:
             return replace(self, F=F)
         F, across = in_plane(F)
@@ -177,13 +177,13 @@ class MaterialPoints:
 
     @property
     def displacement(self) -> NDArray[np.float64]:
-        """Displacement (n, d), m, of the centroids since the start, or since the last reset by a stage."""
+        """Displacement (n, d), m, of the centroids since the start, or since a stage set it to zero."""
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
-        """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer.
+        """Return points with a function applied to each array: a selection, a copy, or a transfer of its entries.
 
-        Fields that share an array still share one.
+        Fields with a common array have a common array again.
         """
         cache: dict[int, NDArray] = {}
 
@@ -196,7 +196,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points where rows (n,) is true, and another state of the same points elsewhere."""
+        """Return these points where rows (n,) is true, and elsewhere `other`, another state of the same points."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -205,33 +205,33 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: chosen(v, other.data[name]) for name, v in self.data.items()})
 
     def joined(self, other: MaterialPoints) -> MaterialPoints:
-        """Return these points and others, ordered by id."""
+        """Return these and other points, ordered by id."""
         order = np.concatenate([self.id, other.id]).argsort()
         pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
         data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
         return type(self)(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
-        """Return the points with these ids; with `kept` false, all other points."""
+        """Return the points with the given ids; if `kept` is false, all other points."""
         rows = np.isin(self.id, ids) == kept
         return self if rows.all() else self.map(lambda values: values[rows])
 
     def migrated(self, exchange: Exchange) -> MaterialPoints:
-        """Return the points of this process after every point went to its destination, ordered by id."""
+        """Return the points that `exchange` moves to this process, ordered by id."""
         arrays = self.arrays
         one = tuple([values is other for other in arrays].index(True) for values in arrays)
-        equal = len(set(exchange.comm.allgather(one))) == 1  # else processes make different numbers of transfers
+        equal = len(set(exchange.comm.allgather(one))) == 1  # else numbers of transfers would differ between processes
         received = (self if equal else self._copied()).map(exchange.send)
         order = received.id.argsort()
         return received.map(lambda rows: rows[order])
 
     def _copied(self) -> MaterialPoints:
-        """Return the points with a separate array for each of their fields."""
+        """Return the points with a separate array for each field."""
         arrays = {f.name: getattr(self, f.name).copy() for f in fields(self) if f.name != "data"}
         return type(self)(**arrays, data={name: values.copy() for name, values in self.data.items()})
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the indices in `ids` of points of this process, and the indices of these points."""
+        """Return which entries of `ids` are points of this process, as indices, and the indices of these points."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)
@@ -246,5 +246,5 @@ class PlacedPoints(MaterialPoints):
     """Material points with true positions, not relative to the grid's `base`; a `State` does not accept them."""
 
     def from_base(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with positions relative to a base (d,), m, as in a state."""
+        """Return the points with positions relative to `base` (d,), m, as in a state."""
         return MaterialPoints(**self._moved(-base))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Connected parts of the bodies: neither forces nor fluid pass from one part to another."""
+"""Connected parts of the bodies: neither forces nor fluid pass between two parts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -23,7 +24,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 class Parts:
     """Connected parts of the bodies on the grid.
 
-    count: number of parts; cells, nodes : (cells,), (nodes,) part of each active local cell and node, from 0, else -1.
+    count: number of parts; cells, nodes (n,): part of each active local cell and node, from 0, else -1.
     """
 
     count: int
@@ -33,7 +34,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a vector on this process, and the part of each entry.
+    """Entries of a distributed vector on this process, with the connected part of each entry.
 
     Parameters
     ----------
@@ -51,32 +52,32 @@ class OfParts:
 
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Order of the entries by parts, the index of each part's first entry, and the parts with entries."""
+        """Order of the entries by part, index of each part's first entry in this order, and the parts with entries."""
         sizes = np.bincount(self.of, minlength=self.count)
         present = sizes.nonzero()[0]
         return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
 
     def sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (..., count) of entries (..., n) over each part, of all processes."""
+        """Return the sums (..., count) of the entries (..., n) of each part, over all processes."""
         order, start, present = self._sorted
         out = np.zeros((*values.shape[:-1], self.count))
-        out[..., present] = np.add.reduceat(values[..., order], start, axis=-1)
+        out[..., present] = np.add.reduceat(values.take(order, axis=-1), start, axis=-1)
         return over_all(self.comm, out)
 
     def norms(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Euclidean norms (..., count) of entries (..., n) of each part."""
+        """Return the Euclidean norms (..., count) of the entries (..., n) of each part, over all processes."""
         return np.sqrt(self.sums(values * values))
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
-        """Number (count,) of entries of each part."""
+        """Number (count,) of entries of each part, over all processes."""
         return self.sums(np.ones(len(self.of)))
 
 
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return norms / scales; 0 where the norm is round-off, and inf in place of nan, so that comparisons notice it."""
+    """Return norms / scales; 0 where a norm is at most `round_off`, and inf in place of nan, for comparisons."""
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -87,13 +88,13 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (cells,), from 1, of each active local cell, and the number of parts.
 
-    Cells with common nodes belong to one part; inactive cells have 0. The order of the first cells numbers the parts,
-    alike on any number of processes.
+    Cells with common nodes belong to one part; inactive cells have part 0. Parts are numbered in the order of their
+    first cells, in the same way on any number of processes.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
-    nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
-    own, count = _joined(np.arange(len(cells)).repeat(2**grid.dim), at.ravel(), (len(cells), len(nodes)))
+    own, count = _touching(grid.cell_places(cells))
     if grid.comm.size > 1:
+        nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
         of_node = np.zeros(len(nodes), dtype=np.int64)
         of_node[at.ravel()] = own.repeat(2**grid.dim)
         own, count = _over_processes(grid, own, count, nodes, of_node)
@@ -105,8 +106,21 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     return out, count
 
 
+def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return the connected part (n,), from 0, of cells by indices and copy (n, d + 1), and the number of parts."""
+    if not len(index):
+        return np.empty(0, dtype=np.int64), 0
+    low = index.min(axis=0)
+    at, box = tuple((index - low).T), np.zeros(index.max(axis=0) - low + 1, dtype=bool)
+    box[at] = True
+    around = np.zeros((3,) * index.shape[1], dtype=bool)
+    around[..., 1] = True  # copies have no nodes in common
+    number, count = label(box, around)
+    return number[at].astype(np.int64) - 1, count
+
+
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected component of each row, from 0, by common columns, and their number; no row is empty."""
+    """Return the connected component of each row, from 0, and their number; rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
@@ -119,7 +133,7 @@ def _over_processes(
     """Return the parts of cells over all processes, and their number.
 
     own: part of each cell on this process; count: number of these parts; nodes (n,): local numbers of the cells' nodes;
-    of_node (n,): part of each node.
+    of_node (n,): part of each node on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])
@@ -130,7 +144,7 @@ def _over_processes(
         shared |= grid.owner(cell) != grid.comm.rank
     number = np.ravel_multi_index(tuple(index[shared].T), tuple(grid.shape + 1)) + copy[shared, 0] * grid.nodes
     pairs = np.concatenate(grid.comm.allgather(np.stack([start + of_node[shared], number], axis=1)))
-    # an extra column for each part
+    # one more column for each part, so that no row is empty
     columns, at = np.unique(pairs[:, 1], return_inverse=True)
     rows = np.concatenate([pairs[:, 0], np.arange(sum(counts))])
     at = np.concatenate([at.ravel(), len(columns) + np.arange(sum(counts))])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Many convex polygons in the plane: cut by lines, and divided into quadrilaterals."""
+"""Convex polygons in the plane, many at once: cut by lines, and divided into quadrilaterals."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 NONE = -1
-"""Number of an edge without a number."""
+"""Edge number of edges without a number."""
 
 
 @dataclass(frozen=True)
 class Polygons:
-    """Polygons (n,) of up to k vertices, anti-clockwise.
+    """n polygons of up to k vertices, anti-clockwise.
 
-    x : (n, k, 2) vertices, m, padded by the last one; count : (n,) number of vertices; edge : (n, k) number of the edge
-    from each vertex to the next, which cuts preserve.
+    x (n, k, 2): vertices, m, padded by the last vertex; count (n,): number of vertices.
+    edge (n, k): number of the edge from each vertex to the next; cuts preserve it.
     """
 
     x: NDArray[np.float64]
@@ -31,12 +31,12 @@ class Polygons:
         return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
 
     def of(self, rows: NDArray) -> Polygons:
-        """Return the polygons `rows`."""
+        """Return the polygons with indices `rows`."""
         return Polygons(self.x[rows], self.count[rows], self.edge[rows])
 
     @property
     def after(self) -> NDArray[np.float64]:
-        """The next vertex (n, k, 2), m, after each vertex."""
+        """Next vertex (n, k, 2), m, after each vertex."""
         last = np.arange(self.x.shape[1]) == self.count[:, None] - 1
         return np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
 
@@ -47,14 +47,14 @@ class Polygons:
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2), m; a vertex of polygons without area."""
+        """Centroids (n, 2), m; for polygons without area a vertex."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])
 
     @property
     def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Areas, and first moments about the first vertices."""
+        """Areas, m^2, and first moments of area about the first vertices, m^3."""
         y = self.x - self.x[:, :1]
         after = np.roll(y, -1, axis=1)
         twice = y[:, :, 0] * after[:, :, 1] - y[:, :, 1] * after[:, :, 0]
@@ -63,7 +63,7 @@ class Polygons:
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
         """Return the part of each polygon where normal . x <= level; normal (n, 2), level (n,).
 
-        The algorithm is that of Sutherland and Hodgman (1974). A new edge has no number.
+        The algorithm is that of Sutherland and Hodgman (1974). New edges have no number.
         """
         n, k = self.edge.shape
         used = np.arange(k) < self.count[:, None]
@@ -80,9 +80,9 @@ class Polygons:
         return _packed(x, edge, kept)
 
     def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
-        """Return the intersection of each polygon with a convex, anti-clockwise one with vertices (n, m, 2).
+        """Return the intersection of each polygon with a convex, anti-clockwise polygon with vertices (n, m, 2).
 
-        near: tolerance, m, within which vertices outside count as inside.
+        near: tolerance, m: vertices within this distance outside count as inside.
         """
         out = self
         for k in range(others.shape[1]):
@@ -93,20 +93,20 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices whose next vertex is within the distance `near`, m."""
+        """Return the polygons without vertices that are nearer than `near`, m, to the next vertex."""
         k = self.edge.shape[1]
         used = np.arange(k) < self.count[:, None]
         return _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Divide convex polygons into quadrilaterals, by the diagonals that divide them most evenly.
+        """Divide convex polygons into quadrilaterals, by the diagonals that divide the area most evenly.
 
-        No vertex and no direction is thus preferred.
+        The result therefore prefers no vertex and no direction.
 
         Returns
         -------
-        Polygon (m,), vertices (m, 4, 2) and edge numbers (m, 4) of each quadrilateral; a triangle also has the middle
-        of its longest edge as a vertex.
+        Index of the polygon (m,), vertices (m, 4, 2) and edge numbers (m, 4) of each quadrilateral.  In a triangle the
+        middle of the longest edge is the fourth vertex.
         """
         left, rows = self, np.arange(len(self.count))
         found = []
@@ -127,7 +127,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Cut a quadrilateral off polygons with the same n > 4 vertices, or a triangle off pentagons; return both."""
+        """Cut a quadrilateral, or from pentagons a triangle, off polygons with n > 4 vertices; return both parts."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
@@ -146,7 +146,7 @@ class Polygons:
         return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], rest)
 
     def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return vertices (n, 4, 2) and edge numbers (n, 4) of triangles, with the middle of the longest edge."""
+        """Return triangles as vertices (n, 4, 2) and edge numbers (n, 4), with the middle of the longest edge."""
         size = np.linalg.norm(self.after - self.x, axis=2)
         order = (size.argmax(axis=1)[:, None] + np.arange(3)) % 3
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)
@@ -154,7 +154,7 @@ class Polygons:
         return np.concatenate([x[:, :1], middle, x[:, 1:]], axis=1), edge[:, [0, 0, 1, 2]]
 
     def _joined(self, other: Polygons) -> Polygons:
-        """Return these polygons and others of no more vertices."""
+        """Return these polygons and others, which have no more vertices."""
         more = self.x.shape[1] - other.x.shape[1]
         x = np.concatenate([self.x, np.pad(other.x, ((0, 0), (0, more), (0, 0)), mode="edge")])
         edge = np.concatenate([self.edge, np.pad(other.edge, ((0, 0), (0, more)), constant_values=NONE)])

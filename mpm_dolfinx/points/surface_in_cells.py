@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface of bodies in single cells of the plane, and quadrilaterals that fill the body behind it."""
+"""The surface of bodies in single cells of the plane, and quadrilaterals that fill the body behind the surface."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
-"""Number of surface edges in a cell with renewed domains.
+"""Number of surface edges in a cell with renewed particle domains.
 
-Plateau (flow): halved 1.6e-03, doubled 1.5e-03, cells 9.0e-02 (relative changes of the result).
+Sensitivity (flow scene): half the value changes the result by 1.6e-03, twice by 1.5e-03, finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
-"""Deviation of the surface from a chord, in cells, that counts as a corner; flatter parts are divided evenly.
+"""Deviation of the surface from a chord, in cells, above which it has a corner; flatter parts are divided evenly.
 
 Source: exact, a chord of one cell in a circle of a cell's radius: the grid cannot resolve a smaller circle.
 """
@@ -28,21 +28,21 @@ _HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 
 
 
 class Region:
-    """The filled part of cells (n,) that the surface crosses once, in coordinates from 0 to 1.
+    """The filled part of n cells that the surface crosses once, in cell coordinates from 0 to 1.
 
     Parameters
     ----------
     cells
-        The cells.
+        Local numbers of the cells.
     surface : (n, EDGES + 1, 2)
-        Vertices of the surface in them, from entry to exit, with the body on the left.
+        Vertices of the surface in each cell, from entry to exit, with the body on the left.
     """
 
     def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):
         self.cells = cells
         edges = surface.shape[1] - 1
-        most = edges + 10  # plus corners and midpoints of the cell's sides, and one more
-        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in half sides
+        most = edges + 10  # plus corners and midpoints of the cell's sides, and one more vertex
+        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in half sides of the cell
         end = np.where(end <= start + NEAR, end + 8, end)
         first = np.floor(start + NEAR).astype(np.int64) + 1
         count = np.maximum(0, np.ceil(end - NEAR).astype(np.int64) - first)
@@ -54,7 +54,7 @@ class Region:
         size = edges + 1 + count
         odd = np.flatnonzero(size % 2)
         after = np.where((np.arange(most) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x[:, :1])
-        at = (edges + size[odd] - 1) // 2  # in the middle of the edges inside the body
+        at = (edges + size[odd] - 1) // 2  # the middle of the edges inside the body
         place = np.arange(most)[None]
         middle = (x[odd, at] + after[odd, at]) / 2
         padded = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)
@@ -72,7 +72,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled fraction of the area of each of `count` cells; 1 for cells that are not in `cells`."""
+        """Return the filled area fraction of each of `count` cells; 1 for cells that are not in `cells`."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -80,7 +80,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return region (m,) and corners (m, 4, 2) of each new domain, and which faces (m, 4) lie on the surface."""
+        """Return region (m,) and corners (m, 4, 2) of each new domain, and which of its faces (m, 4) are surface."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -103,11 +103,11 @@ class Region:
 def resampled(
     of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return vertices (n, EDGES + 1, 2) of surfaces from P to Q (n, 2), evenly along their parts.
+    """Return surfaces as vertices (n, EDGES + 1, 2) from P to Q (n, 2), at even distances between corners.
 
-    The area between surface and chord is preserved: vertices shift by the lost area.
+    The area between surface and chord is preserved: vertices are shifted to restore the lost area.
 
-    of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
+    of (m,), x (m, 2, 2): surface of each segment, in order, and the segment's ends.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])
@@ -116,10 +116,10 @@ def resampled(
     out = np.concatenate([P[:, None], np.zeros((len(P), EDGES - 1, 2)), Q[:, None]], axis=1)
     at = np.zeros((len(P), EDGES + 1))
     at[:, 0], at[:, -1] = ends
-    joint = (x[:, 0] + np.roll(x[:, 1], 1, axis=0)) / 2  # parts may gape a little
+    joint = (x[:, 0] + np.roll(x[:, 1], 1, axis=0)) / 2  # there may be small gaps between segments
 
     def divide(low: int, high: int) -> None:
-        """Put a vertex between two others: at the sharpest corner, or in the middle of a nearly straight part."""
+        """Set a vertex between two others: at the sharpest corner, or in the middle of a nearly straight part."""
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
         off = joint - a[of]
@@ -135,7 +135,7 @@ def resampled(
         out[:, middle] = (place(target - NEAR) + place(target + NEAR)) / 2  # alike from both ends
 
     def place(target: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the places (n, 2) so far, in cells, along the parts."""
+        """Return the positions (n, 2), in cells, at arc lengths `target` (n,) along the segments."""
         part = np.clip(np.searchsorted(arc, target, side="right") - 1, first, stop - 1)
         t = (target - arc[part]) / np.maximum(length[part], TINY)
         return x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
@@ -159,12 +159,12 @@ def resampled(
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products (...) of vectors (..., 2): twice the area between them."""
+    """Return the cross products (...) of vectors (..., 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return anti-clockwise coordinates, from 0 to 4, of positions (n, 2) on the border of the unit square."""
+    """Return the distance, from 0 to 4, of positions (n, 2) on the border of the unit square, anti-clockwise."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Pressures of cells from the pore water of their pieces, in unsaturated soil.
+"""Cell pressures from the pore water of the pieces of particle domains, in unsaturated soil.
 
-The fluid content of a piece with storage s (m^d/Pa) and pore volume n, less its value at zero pressure, is c(p) = s
-pi(p) + n (S(p) - 1) rho(p).  pi is the mass potential, rho the density relative to zero pressure.  A piece above or
-below its cell's centroid, or of another soil, has c(p + o) with its own S and offset o.
+A piece has storage s (m^d/Pa) and pore volume n (m^d).  Its fluid content minus that at zero pressure is
+c(p) = s pi(p) + n (S(p) - 1) rho(p), with the mass potential pi and the density rho relative to zero pressure.  In a
+piece away from its cell's centroid the pressure is p + o, with an offset o; soils differ in S.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (
 class PoreWater:
     """Water storage of m pieces in n cells.
 
-    saturation: function of pressures (m,), Pa, returns S, its slope (m,), 1/Pa, and maybe more; slot (m,): cell of each
-    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: fluid's bulk modulus, Pa; scale (n,): suction at which pores of a
-    cell drain, Pa.
+    saturation: function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and maybe more.
+    slot (m,): cell of each piece; store (m,), m^d/Pa: storage; pores (m,), m^d: pore volume; bulk: fluid's, Pa.
+    scale (n,), Pa: suction at which the pores of a cell drain.
     """
 
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
@@ -40,30 +40,30 @@ class PoreWater:
     scale: NDArray[np.float64]
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (S - 1) rho of the pieces, and its slope, 1/Pa, at pressures (m,), Pa."""
+        """Return (S - 1) rho of the pieces, and its derivative, 1/Pa, at pressures p (m,), Pa."""
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the contents of the cells (n,), m^d, by pressures of their pieces (m,), Pa."""
+        """Return the fluid contents of the cells (n,), m^d, for pressures p (m,), Pa, of their pieces."""
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the contents of the cells (n,), m^d, by potentials, Pa, and (S - 1) rho of their pieces (m,)."""
+        """Return the fluid contents of the cells (n,), m^d, for pi, Pa, and (S - 1) rho of the pieces (m,)."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(
         self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, of cells with given contents (n,), m^d.
+        """Return the pressures (n,), Pa, of cells with given fluid contents (n,), m^d.
 
-        Newton's method on the logarithm of the suction, within a bracket.
+        Newton's method is applied to the logarithm of the suction, within a bracket.
 
         Parameters
         ----------
         p : (n,), Pa
-            Initial values, returned unchanged if their contents are right.
+            Initial values; they are returned if their contents are right.
         offset : (m,), Pa
-            Pressures of pieces minus pressures of their cells.
+            Pressures of the pieces minus pressures of their cells.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)
@@ -95,6 +95,6 @@ class PoreWater:
 def emptied(
     p: NDArray[np.float64], bulk: float, S: NDArray[np.float64], slope: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (S - 1) rho and its slope, 1/Pa, for pressures (m,), Pa, saturations, and slopes of S, 1/Pa."""
+    """Return (S - 1) rho and its derivative, 1/Pa, for pressures p (m,), Pa, saturations S, and slope dS/dp, 1/Pa."""
     density = np.exp(p / bulk)
     return (S - 1) * density, (slope + (S - 1) / bulk) * density

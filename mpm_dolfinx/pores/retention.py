@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Retention curves: saturation, relative permeability and Bishop's coefficient as functions of the pressure.
+"""Retention curves: saturation, relative permeability and Bishop's coefficient as functions of the pore pressure.
 
-Air has zero pressure everywhere, so the suction is s = -p.  Without suction pores are saturated.  With the saturation S
-and the relative permeability k_r, both functions of p,
+Air has zero pressure everywhere, so the suction is s = -p.  For p >= 0 pores are saturated.  With the saturation S and
+the relative permeability k_r as functions of p,
 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
 (Richards 1931; Bishop 1959).  By default chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
 
-A user-defined law is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  Its optional
-`bishop(p)` is chi; by default chi = S.  Constants of laws derived from `Retention` can change without compilation.
+A user-defined curve is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  It may have
+`bishop(p)`, which returns chi; by default chi = S.  Constants of laws derived from `Retention` are not compiled.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ METHODS = ("saturation", "relative_permeability")
 
 @dataclass(frozen=True)
 class Retention:
-    """Law of retention by an effective saturation: S = S_r + (1 - S_r) S_e.
+    """Base of retention curves defined by an effective saturation S_e: S = S_r + (1 - S_r) S_e.
 
-    A law derived from it is a frozen dataclass of numbers.  It defines `effective(s)` and `conducts(s)`: S_e and k_r as
-    UFL of the suction s >= 0, Pa, both 1 at s = 0.  Its `bishop(p)` is S_e unless it defines another.
+    A derived law is a frozen dataclass of numbers.  It defines `effective(s)` and `conducts(s)`: S_e and k_r as UFL of
+    the suction s >= 0, Pa, both 1 at s = 0.  `bishop(p)` is S_e unless the law defines it.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Retention:
     Raises
     ------
     ValueError
-        A constant out of its range.
+        A constant is out of its range.
     """
 
     entry: float
@@ -87,16 +87,16 @@ class VanGenuchten(Retention):
     Parameters
     ----------
     entry
-        1 / alpha as a pressure, Pa, > 0: the weight of water over alpha in 1/m.
+        Pressure that corresponds to van Genuchten's alpha, Pa, > 0: unit weight of water / alpha, with alpha in 1/m.
     residual
         Residual saturation S_r, in [0, 1).
     n
-        Uniformity of the pore sizes, in (1, 20].
+        Exponent that increases with the uniformity of the pore sizes, in (1, 20].
     l
-        Connectivity of the pores, a number.
+        Exponent for the connectivity of the pores, a number.
     air_entry
-        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  For n < 2 and zero air
-        entry the permeability has an infinite slope at s = 0.  A few centimetres of water are usual.
+        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  If n < 2, zero air
+        entry gives the permeability an infinite slope at s = 0.  The weight of a few centimetres of water is usual.
     """
 
     n: float = 2.0
@@ -114,7 +114,7 @@ class VanGenuchten(Retention):
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
 
     def _least(self):
-        """Return air entry / `entry`, > 0, because powers of zero have no derivatives."""
+        """Return air entry / `entry`, but > 0, because powers of zero have no derivatives."""
         return ufl.max_value(self.air_entry / self.entry, TINY)
 
     def effective(self, s):
@@ -135,7 +135,7 @@ class Gardner(Retention):
     Parameters
     ----------
     entry
-        Suction that reduces them by a factor e, Pa, > 0: the weight of water over Gardner's alpha in 1/m.
+        Suction at which S_e = k_r = 1/e, Pa, > 0: unit weight of water / Gardner's alpha, with alpha in 1/m.
     residual
         Residual saturation S_r, in [0, 1).
     """
@@ -158,7 +158,7 @@ class BrooksCorey(Retention):
     residual
         Residual saturation S_r, in [0, 1).
     index
-        Uniformity of the pore sizes, in (0, 20].
+        Exponent that increases with the uniformity of the pore sizes, in (0, 20].
     """
 
     index: float = 2.0
@@ -177,15 +177,15 @@ class BrooksCorey(Retention):
 
 
 def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
-    """Raise ValueError for a constant of a law that fails a test."""
+    """Raise ValueError if a constant of a law fails a test."""
     what = f"{type(law).__name__}: {name}"
     numbers(what, getattr(law, name), test=lambda v: np.isfinite(v) & test(v), allowed=allowed)
 
 
 def check_retention(what: str, law) -> None:
-    """Raise ValueError for an invalid retention curve.
+    """Raise ValueError if a retention curve is invalid.
 
-    S and k_r must be in [0, 1], 1 at p >= 0, and must not rise with the suction.
+    S and k_r must be in [0, 1], 1 for p >= 0, and must not increase with the suction.
     """
     missing = [name for name in METHODS if not callable(getattr(law, name, None))]
     if missing:
@@ -205,23 +205,23 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return saturations and relative permeabilities at some suctions, as a fingerprint of the law."""
+    """Return saturations and relative permeabilities of a law at some suctions, Pa, as its fingerprint."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the number at a pressure, Pa, of a function of p that returns UFL."""
+    """Return the number, at a pressure p, Pa, of a function of p that returns UFL."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
 def chi_at(law, p: float) -> float:
-    """Return Bishop's coefficient chi of a law at a pressure p, Pa."""
+    """Return Bishop's coefficient chi at a pressure p, Pa."""
     return _value(partial(property_of, law, "bishop"), p)
 
 
 def _empty(function: Callable, suction: float) -> bool:
-    """Return whether a function of p is at most a half, or not a number, at a suction, Pa."""
+    """Return whether a function of p is at most 0.5, or not a number, at a suction, Pa."""
     try:
         return not _value(function, -suction) > 0.5
     except OverflowError:
@@ -229,9 +229,9 @@ def _empty(function: Callable, suction: float) -> bool:
 
 
 def scale_of(law) -> float:
-    """Return the characteristic suction of a law, Pa: its `scale`, or approximately where the saturation is a half.
+    """Return the characteristic suction of a law, Pa: its `scale`, or approximately the suction for S = 0.5.
 
-    If the saturation does not fall that far, the permeability is used.
+    If S is always above 0.5, the suction for k_r = 0.5 is returned.
     """
     if (scale := getattr(law, "scale", None)) is not None:
         return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
@@ -244,41 +244,41 @@ def scale_of(law) -> float:
             suction *= 2
         if half(suction):
             return suction
-    raise ValueError(f"{line(law)}: saturation never falls to a half, must do so or have a scale, Pa")
+    raise ValueError(f"{line(law)}: saturation never falls to 0.5, must fall to 0.5, or the law must have a scale, Pa")
 
 
 class Retentions:
-    """Retention curves of a scene, as UFL of point data.
+    """Retention curves of the materials, as UFL expressions of data at the integration points.
 
-    Points carry a row: the number of the kind of their law, from 1, and its constants; 0 if pores stay saturated.
-    Pieces also carry their `lever`, the vector from the centroid of the material in their cell.  Their pressure is
-    hydrostatic about the pressure of the cell.
+    The points' field `retention` is a vector: the law's kind, from 1, and its constants; 0 if pores stay saturated.
+    Pieces also have the field `lever`, the vector from the centroid of the material in their cell.  The pressure in a
+    piece is the cell pressure plus the hydrostatic difference over `lever`.
 
     Parameters
     ----------
     laws
         Distinct retention curves of the scene's materials.
     everywhere
-        Whether every material has one.
+        Whether every material has a retention curve.
     grid
         Background grid.
     """
 
     def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
         self.weight = fem.Constant(grid.mesh, np.zeros(grid.dim))
-        """Weight of the fluid at the grid reset, N/m^3; zero if no fluid can flow."""
+        """Unit weight of the fluid at the reset of the grid, N/m^3; zero if no fluid can flow."""
         self.laws = list(laws)
         self._everywhere = everywhere
         self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
         self._first = [next(law for law in self.laws if self._kind(law) == i) for i in range(len(self._kinds))]
         self.width = 1 + max(len(_constants(law)) for law in self.laws)
-        """Length of a row."""
+        """Length of the vector `retention`."""
 
     def _kind(self, law) -> int:
         return self._kinds.index(type(law) if isinstance(law, Retention) else law)
 
     def row(self, law) -> NDArray[np.float64]:
-        """Return the row of a law, or of None."""
+        """Return the vector `retention` of a law, or of saturated soil (None)."""
         out = np.ones(self.width)
         out[0] = 0 if law is None else 1 + self._kind(law)
         if law is not None:
@@ -287,26 +287,26 @@ class Retentions:
         return out
 
     def number(self, law) -> int:
-        """Return the number of a law among all, from 1; 0 for None."""
+        """Return the number of a law among all laws, from 1; 0 for None."""
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure offset from the cell (m,), Pa, at levers (m, d), m."""
+        """Return hydrostatic pressure differences to the cell (m,), Pa; lever (m, d): vectors from the centroid, m."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
-        """Return the pressures of points in cells of pressures p, Pa, as UFL."""
+        """Return the pressures of integration points, Pa, as UFL; p: pressures of their cells, Pa."""
         return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
 
     def of(self, name: str, p, points: FormPoints):
-        """Return a property of the pores of points in cells of pressures p, Pa, as UFL.
+        """Return a property of the pores at integration points as UFL; p: pressures of their cells, Pa.
 
         Parameters
         ----------
         name
             "saturation", "relative_permeability" or "bishop".
         points
-            Points with the field retention, and for pieces with lever.
+            Integration points with the field `retention`, and for pieces with `lever`.
         """
         row = points.retention
         p = self.at(p, points)
@@ -321,12 +321,12 @@ class Retentions:
 
 
 def _constants(law) -> list[str]:
-    """Return the names of a law's constants that are not compiled into forms."""
+    """Return the names of a law's constants, which are data, not compiled into forms."""
     return [f.name for f in fields(law)] if isinstance(law, Retention) else []
 
 
 def _lifted(law, values: Sequence):
-    """Return a law with UFL in place of its constants."""
+    """Return a copy of a law with UFL values as its constants."""
     out = copy(law)
     if isinstance(law, Retention):
         vars(out).update(zip(_constants(law), values, strict=False))
@@ -334,14 +334,14 @@ def _lifted(law, values: Sequence):
 
 
 def property_of(law, name: str, p):
-    """Return a property of a law at pressures p, Pa, as UFL: see `Retentions.of`."""
+    """Return a property of a law at pressures p, Pa, as UFL; name: see `Retentions.of`."""
     if name == "bishop" and not hasattr(law, "bishop"):
         name = "saturation"
     return _called(law, name, p)
 
 
 def _called(law, name: str, p):
-    """Return the result of a law's method at p as UFL.
+    """Return the result of a law's method at pressures p, Pa, as UFL.
 
     Raises
     ------
@@ -356,14 +356,14 @@ def _called(law, name: str, p):
 
 
 class SaturationAt:
-    """Saturations, and their slopes, of any points at given pressures.
+    """Saturation and its derivative, Bishop's coefficient and relative permeability at given pressures.
 
     Parameters
     ----------
     grid
         Background grid.
     retentions
-        The laws of the scene.
+        Retention curves of the scene.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -376,30 +376,30 @@ class SaturationAt:
     def __call__(
         self, rows: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return S, its slope, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): rows of the points."""
+        """Return S, dS/dp, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): the field `retention`."""
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
         return S, slope, chi, k
 
 
 def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
-    """Return points (m,) with some fields (m, ...), all in one cell, for expressions independent of position."""
+    """Return points (m,) with the given fields (m, ...), all in one cell; their positions must not matter."""
     count = len(next(iter(fields.values())))
     cells = np.zeros(count, dtype=np.int32)
     return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
 
 
 class Conductance:
-    """Integral of a law's relative permeability over the pressure, the potential of flow (Kirchhoff 1894).
+    """Integral of a law's relative permeability with respect to pressure, the potential of flow (Kirchhoff 1894).
 
-    It is a table over the logarithm of the suction, with cubic Hermite interpolation between the rows.
+    The integral is tabulated against the logarithm of the suction, and interpolated with cubic Hermite polynomials.
 
     Parameters
     ----------
     grid
         Background grid.
     law
-        The law.
+        The retention curve.
     """
 
     def __init__(self, grid: Grid, law):
@@ -416,18 +416,18 @@ class Conductance:
         parts = half * (inside @ w)
         self._phi = np.append(np.cumsum(parts[::-1])[::-1], 0.0)
         self._whole = self._phi[0] + edges[0] * (1 + self._k[0]) / 2
-        self._slope = -self._k * edges * self._step  # of the integral from row to row
+        self._slope = -self._k * edges * self._step  # derivative of the integral with respect to the row number
         self._edges = edges
 
     def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the integral up to pressures (n,), Pa, k_r, and its slope, 1/Pa (n, 3)."""
+        """Return the integral, Pa, k_r, and its derivative, 1/Pa, (n, 3) at pressures p (n,), Pa."""
         s = np.clip(-p, self._edges[0], self._edges[-1])
         z = (np.log(s) - self._low) / self._step
         i = np.minimum(z.astype(np.int64), ROWS - 2)
         z = z - i
         a, b = self._phi[i], self._phi[i + 1]
         c, d = self._slope[i], self._slope[i + 1]
-        # a cubic about the row below: a + c z + e z^2 + f z^3
+        # a cubic in z from the lower row: a + c z + e z^2 + f z^3
         e, f = 3 * (b - a) - 2 * c - d, 2 * (a - b) + c + d
         phi = a + z * (c + z * (e + z * f))
         first, second = c + z * (2 * e + 3 * z * f), 2 * e + 6 * z * f
@@ -441,35 +441,36 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of suctions of the table, over the law's scale.  Source: exact beyond, within an equally small fraction."""
+"""Range of suctions in the table / law's scale.  Source: exact beyond the range, up to a fraction as small."""
 ROWS = 4000
-"""Rows of the table.
+"""Number of tabulated suctions.
 
-Plateau (dry): halved 2.1e-08, doubled 2.6e-09, cells 6.6e-03 (relative changes of the result).
+Sensitivity (dry scene): half the value changes the result by 2.1e-08, twice by 2.6e-09, finer cells by 6.6e-03.
 """
 GAUSS = 8
-"""Quadrature points between two rows.
+"""Quadrature points between two tabulated suctions.
 
-Plateau (dry): halved 8.2e-10, doubled 1.5e-09, cells 6.6e-03 (relative changes of the result).
+Sensitivity (dry scene): half the value changes the result by 8.2e-10, twice by 1.5e-09, finer cells by 6.6e-03.
 """
 
 
 def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return scaled pressures of (n,), Pa: logarithmic in the suction beyond `scale`, Pa; inverse of `pressure_at`."""
+    """Return a scaled pressure (n,), logarithmic for suctions above `scale`, Pa; `pressure_at` is the inverse."""
     return np.where(p < 0, np.arcsinh(p / scale), p / scale)
 
 
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pressures (n,), Pa, of values (n,) of `logarithm`."""
+    """Return the pressures (n,), Pa, at which `logarithm` has the values y (n,)."""
     return np.where(y < 0, scale * np.sinh(y), scale * y)
 
 
 FARTHEST = np.log(10)
-"""Largest change of the suction's logarithm in a Newton step; fronts into dry soil do not converge without it.
+"""Largest change of the suction's logarithm in a Newton step; without a limit, fronts in dry soil do not converge.
 
-Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
+Celia's column of 25 and 100 cells, 28 time steps: 310 and 500 Newton steps with a limit of 2; with a limit of 4, 330
+and 920, and four time steps are reduced.
 
-Plateau (dry): halved 7.6e-10, doubled 9.8e-10, cells 6.6e-03 (relative changes of the result).
+Sensitivity (dry scene): half the value changes the result by 7.6e-10, twice by 9.8e-10, finer cells by 6.6e-03.
 """
 
 
@@ -479,11 +480,11 @@ def restrained(
     scale: NDArray[np.float64] | float,
     previous: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return limited pressure decreases (n,), Pa, of a Newton step.
+    """Return the pressure decreases (n,), Pa, of a Newton step after limitation.
 
-    A step stops at the characteristic suction.  On each side of it the saturation is convex or concave, and Newton's
-    method converges (Wang and Tchelepi 2013).  The logarithm of the suction changes by at most `FARTHEST`.  A change in
-    the opposite direction is at most half of the change before, which prevents oscillations.
+    A step ends at the characteristic suction.  On each side of this suction the saturation is convex or concave, so
+    Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at most `FARTHEST`.  If the
+    direction reverses, the change is at most half of the previous change, which prevents oscillations.
 
     Parameters
     ----------
@@ -492,7 +493,7 @@ def restrained(
     scale : (n,), Pa
         Characteristic suction.
     previous : (n,)
-        Change of their `logarithm` in the step before.
+        Change of the pressure's `logarithm` in the previous Newton step.
     """
     new, limit = p - dp, -scale
     new = np.where((p - limit) * (new - limit) < 0, limit, new)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Results at points, cells and probes."""
+"""Results at material points, cells and probes."""

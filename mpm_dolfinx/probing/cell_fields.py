@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Present fields of the cells: centroids, displacements, pressures, stresses."""
+"""Present fields in the cells: centroids, displacements, pressures, stresses."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from mpm_dolfinx.stepping.state import State
 
 @dataclass(frozen=True)
 class CellFields:
-    """Fields of the non-empty cells of this process; arrays over n cells.
+    """Fields in the non-empty cells of this process; arrays for n cells.
 
-    The fields refer to the present position of the grid for the next step.  They are second-order accurate at `x`, not
-    at the midpoint of the cell.  Means are volume averages over the content of the cell.
+    The fields refer to the position of the grid for the next step.  They are second-order accurate at `x`, not at
+    the midpoint of the cell.  Means are volume averages over the material in the cell.
 
     Attributes
     ----------
     cell : (n,)
         Local number of the cell in the grid's mesh.
     x : (n, d), m
-        Centroid of the content.
+        Centroid of the material in the cell.
     volume : (n,), m^d
-        Volume of the content.
+        Volume of the material in the cell.
     displacement : (n, d), m
-        Mean displacement since the start, or since a stage reset it.
+        Mean displacement since the start, or since a stage set it to zero.
     effective_stress, stress : (n, d, d), in axisymmetry (n, 3, 3), Pa
         Mean effective and total Cauchy stress, tension positive.
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Volume of pore fluid at zero pressure, less the volume defect `owed` of the points; None without fluid.
+        Volume that the pore fluid would have at zero pressure, minus the points' volume defect; None without fluid.
     """
 
     cell: NDArray[np.int64]
@@ -50,7 +50,7 @@ class CellFields:
 
 
 def cell_fields(scene: Scene, state: State) -> CellFields:
-    """Return the cell fields of a state; all processes call it together."""
+    """Return the cell fields of a state; all processes must call it."""
     scene.rests_at(state.stage, state.t)
     state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
@@ -61,7 +61,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means in the cells of values (m, ...) at the cut subdomains."""
+        """Return the means in the cells of values (m, ...) in the pieces."""
         columns = values.reshape(len(values), -1).T
         sums = [sum_by(places.slots, weight * column, len(volume)) / volume for column in columns]
         return np.stack(sums, axis=1).reshape(len(volume), *values.shape[1:])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fields of the material points: stresses in three dimensions, invariants, porosity, saturation."""
+"""Fields of the material points: stresses in three dimensions, stress invariants, porosity, saturation."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class PointFields:
     ----------
     effective_stress, stress : (n, 3, 3), Pa
         Effective and total stress.  In axisymmetry x is the radius, y the axis and zz the hoop stress.  In plane strain
-        zz acts across the plane; zz and the invariants are nan for user laws that are defined in the plane only.
+        zz acts out of plane; zz and the invariants are nan for user-defined laws without an out-of-plane stress.
     mean_effective_stress : (n,), Pa
         p' = -tr(effective stress) / 3, positive in compression.
     deviatoric_stress : (n,), Pa
-        q = sqrt(3/2 s : s) with the deviator s of the stress; |axial - radial| stress in a triaxial test.
+        q = sqrt(3/2 s : s) with the deviatoric stress s; in a triaxial test |axial stress - radial stress|.
     porosity : (n,)
-        Present volume fraction of the pores, 1 - (1 - n_0) / J.
+        Present porosity, 1 - (1 - n_0) / J.
     saturation : (n,)
         Degree of saturation of the pores; 0 without fluid.
     """
@@ -40,7 +40,7 @@ class PointFields:
 
 
 def point_fields(scene: Scene, points: MaterialPoints) -> PointFields:
-    """Return the fields of some points; all processes call it together."""
+    """Return the fields at some points; all processes must call it."""
     materials, effective = scene.materials, scene.materials.effective_stress_3d(points)
     pore = materials.pore_stress(points)
     mean = np.trace(effective, axis1=1, axis2=2) / 3

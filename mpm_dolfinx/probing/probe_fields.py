@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Pore pressure and stress at probes, by a weighted fit to surrounding cells and points (`LocalFit`).
+"""Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`LocalFit`).
 
-A cell takes part if open faces connect it to the probe's cell and it lies within three cells along each axis.  It must
-contain only soil with the conductivity and stiffness of the probe's soil.  At faces to other cells the fit takes the
-face pressure of the two-point flux, and on drained sides the prescribed pressure.  Heads are fitted instead of
-pressures, so hydrostatic states are exact.  The result is limited by the heads of the probe's cell, its neighbours and
-the drained sides in it.  Towards an undrained side the limit is extrapolated with the slope of the adjacent cells.
+The fit uses the cells within three cells of the probe's cell along each axis, if open faces connect them to it.  Their
+soil must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the
+face pressure of the two-point flux.  On drained sides it uses the prescribed pressure.  Heads are fitted instead of
+pressures, so hydrostatic states are exact.  The heads of the probe's cell, of its neighbours and of the cell's drained
+sides bound the result.  Towards an undrained side the bound is extrapolated with the slope of the adjacent cells.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 CELLS = int(RADIUS)
-"""Cells along each axis from a probe's cell to the last one with a weight in `LocalFit`."""
+"""Number of cells along each axis from a probe's cell to the last cell with a weight in `LocalFit`."""
 
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the pore pressures (m,), Pa, at probes; all processes call it together."""
+    """Return the pore pressures (m,), Pa, at probes; all processes must call it."""
     state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
@@ -42,11 +42,11 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 
 
 class _Lattice:
-    """Blocks of (2 REACH + 1)^d cells around the cells of m probes.
+    """Blocks of (2 CELLS + 1)^d cells around the cells of m probes.
 
-    number (m, cells): lexicographic numbers, -1 outside the grid; midpoint, size (m, cells, d), m; middle: index of the
-    probe's cell in its block; stride (d,): index increment along each axis; neighbours: for each axis and end, cells
-    with a neighbour there, and these neighbours.
+    number (m, cells): lexicographic numbers, -1 outside the grid; midpoint, size (m, cells, d), m.
+    middle: index of the probe's cell in its block; stride (d,): increment of this index along each axis.
+    neighbours: for each axis and end, the cells that have a neighbour there, and these neighbours.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -54,13 +54,13 @@ class _Lattice:
         copy, number = np.divmod(cell, grid.cells)
         index = np.stack(np.unravel_index(number, tuple(grid.shape)), axis=1)
         steps = np.stack(np.unravel_index(np.arange(width**d), (width,) * d), axis=1)
-        there = index[:, None] + steps - CELLS
-        inside = ((there >= 0) & (there < grid.shape)).all(axis=2)
-        number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
+        place = index[:, None] + steps - CELLS
+        inside = ((place >= 0) & (place < grid.shape)).all(axis=2)
+        number = grid.number(np.where(inside[:, :, None], place, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
-        self.midpoint = grid.places(there, 0.5)
-        self.size = np.broadcast_to(grid.widths_of(np.clip(there, 0, grid.shape - 1).reshape(-1, d)), (inside.size, d))
-        self.size = self.size.reshape(there.shape)
+        self.midpoint = grid.places(place, 0.5)
+        self.size = np.broadcast_to(grid.widths_of(np.clip(place, 0, grid.shape - 1).reshape(-1, d)), (inside.size, d))
+        self.size = self.size.reshape(place.shape)
         self.middle = len(steps) // 2
         self.stride = width ** np.arange(d)[::-1]
         self.neighbours = {}
@@ -71,11 +71,10 @@ class _Lattice:
 
 
 class _Around:
-    """Data of the cells around m probes, equal on every process.
+    """Data of the cells around m probes, equal on every process; arrays (m, cells, ...).
 
-    All are arrays (m, cells, ...): p, Pa; centroid (d,), m, from the probe; half (d,), m: centroid from the midpoint of
-    the cell; open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: see
-    `_connected`.
+    p, Pa; centroid (d,), m, from the probe; half (d,), m: centroid from the cell's midpoint.
+    open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: see `_connected`.
     """
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
@@ -86,10 +85,10 @@ class _Around:
         d = scene.grid.dim
         m = len(probes.id)
         soils = np.column_stack([scene.materials.conducting(points), points.material])
-        here, at = points.find(probes.id)
+        known, at = points.find(probes.id)
         own = np.zeros((m, d + 4))
-        x = interpolate(points.corners[at], probes.xi[here]) if cut.domains else points.x[at]
-        own[here] = np.column_stack([x, soils[at], cut.cells_at(at, x)])
+        x = interpolate(points.corners[at], probes.xi[known]) if cut.domains else points.x[at]
+        own[known] = np.column_stack([x, soils[at], cut.cells_at(at, x)])
         x, key, cell = np.split(over_all(scene.grid.comm, own), [d, d + 3], axis=1)
         self._lattice = lattice = _Lattice(scene.grid, cell[:, 0].astype(np.int64))
         self._x = x
@@ -107,9 +106,9 @@ class _Around:
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local numbers (m, cells) of owned cells, -1 for others, and the data of all cells.
 
-        p: pressures of the filled owned cells, Pa; soils (k, 3): keys of conductivity, its law and material of the cut
-        subdomains.  Columns of the data: 1 for filled cells, p, centroid, mobility, shift, keys (nan if the subdomains
-        of a cell differ), open fractions.
+        p: pressures of the filled owned cells, Pa; soils (k, 3): conductivity, its law and material of the pieces.
+        Columns of the data: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan if the pieces of a cell
+        differ), open fractions.
         """
         grid = self._grid
         contents = self._contents
@@ -118,7 +117,7 @@ class _Around:
         mobility = on_grid.resting_mobility()
         slot = contents.slot(on_grid.cut.cells)
         held = np.zeros((len(filled), 3))
-        held[slot] = soils  # of any cut subdomain in the cell
+        held[slot] = soils  # of any piece in the cell
         held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (soils != held[slot]).T], axis=1)] = np.nan
         one = np.ones((len(filled), grid.dim))
         kappa = mobility.mean[:, None] * (one if mobility.share is None else mobility.share)
@@ -134,10 +133,9 @@ class _Around:
         return local, over_all(grid.comm, out)
 
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which cells (m, cells) take part in the fit, and which lie behind their or the probe's open faces.
+        """Return which cells (m, cells) the fit uses, and which are connected to the probe's cell by open faces.
 
-        If no cell contains only the probe's soil, as in thin layers or graded soil, cells of its material take part,
-        else all cells.
+        If no cell contains only the probe's soil, as in thin layers, the fit uses cells of its material, or else all.
 
         same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """
@@ -151,23 +149,23 @@ class _Around:
         start[:, self._lattice.middle] = True
         reached, passes = start & self._filled, groups | start
         for _ in range(2 * CELLS * self._grid.dim):
-            for (axis, end), (here, there) in self._lattice.neighbours.items():
-                reached[:, there] |= (reached & passes)[:, here] & self._opening(axis, end)
+            for (axis, end), (one, other) in self._lattice.neighbours.items():
+                reached[:, other] |= (reached & passes)[:, one] & self._opening(axis, end)
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return which pairs of neighbours (m, n) along an axis have an open face between them."""
-        here, there = self._lattice.neighbours[axis, end]
-        return (self._open[:, here, axis, end] > 0) & (self._open[:, there, axis, 1 - end] > 0)
+        """Return which pairs (m, n) of neighbours along an axis have an open face between them."""
+        one, other = self._lattice.neighbours[axis, end]
+        return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the probes; weight (d,), N/m^3: unit weight of the fluid."""
+        """Return the pressures (m,), Pa, at the probes; weight (d,): unit weight of the fluid, N/m^3."""
         comm = self._grid.comm
         head = self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
         rows = [(at, offset, value, share)]
-        if comm.rank == 0:  # data that all processes share
+        if comm.rank == 0:  # data that are equal on all processes are added once
             probe, place = np.nonzero(self._counts)
             rows += [(probe, self._centroid[probe, place], head[probe, place], np.ones(len(probe)))]
             rows += self._outside_faces(head)
@@ -185,7 +183,7 @@ class _Around:
         return np.clip(base + fit.values(comm)[:, 0], low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return lower and upper bounds (m,) of the head, Pa: heads of cell and neighbours, extrapolated to a side."""
+        """Return bounds (m,) of the head, Pa: heads of cell and neighbours, extrapolated to an undrained side."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
@@ -212,7 +210,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return probes, offsets, heads and weights at faces to cells outside the fit, by the two-point flux."""
+        """Return probes, offsets, heads and weights at faces to cells outside the fit, from the two-point flux."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -233,9 +231,9 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return probes, offsets, heads and weights of drained sides in the fit, and whether they cut the probe's cell.
+        """Return probes, offsets, heads and weights at drained sides in the fit, and whether in the probe's cell.
 
-        A side of a cell has one value at its centre, because values of several faces would create slopes along it.
+        Each side of a cell gives the fit one head, the mean over its faces. Separate heads would cause false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))
@@ -257,6 +255,6 @@ class _Around:
 
 
 def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the effective stresses (m, 3, 3), Pa, at probes; all processes call it together."""
+    """Return the effective stresses (m, 3, 3), Pa, at probes; all processes must call it."""
     comm, sizes = scene.grid.comm, list(map(len, scene.bodies))
     return fitted_at(comm, sizes, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)

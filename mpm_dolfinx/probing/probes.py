@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Probes: material particles with recorded displacement, pressure and stress."""
+"""Probes: tracked material particles with recorded displacement, pressure and stress."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class Probes:
     """m tracked material particles.
 
-    x0 (m, d): reference positions, m; id (m,): particle domain of each; xi (m, d): local coordinates in it; bodies:
-    bodies of the scene; stressed: whether stresses are recorded too.
+    x0 (m, d): reference positions, m; id (m,): particle domain of each probe; xi (m, d): local coordinates in it.
+    bodies: bodies of the scene; stressed: whether stresses are recorded too.
     """
 
     x0: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Probes:
     stressed: bool = False
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-        """Raise a ValueError for a scene with other bodies, or without a probed body."""
+        """Raise ValueError if the scene has other bodies, or if a probe is in an absent body."""
         if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
             raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
@@ -47,24 +47,26 @@ class Probes:
             raise ValueError(f"probe at {self.x0[first]}: in body {body[first]}, must be in a body that is present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, interpolate(points.corners[at] - points.origin[at], self.xi[here]))
+        """Return the displacements (m, d), m, of the probes on every process."""
+        known, at = points.find(self.id)
+        return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the present positions (m, d), m, on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
+        """Return the present positions (m, d), m, of the probes on every process."""
+        known, at = points.find(self.id)
+        return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
-    def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (m, ...) on every process, from the values of the probes on this process."""
+    def _shared(
+        self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the values (m, ...) of all probes on every process; here, values: of the probes on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
-        out[here] = values
+        out[known] = values
         return over_all(comm, out)
 
 
 def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> None:
-    """Raise a ValueError if renewal has replaced the domain of a probe."""
+    """Raise ValueError if renewal of particle domains has replaced the domain of a probe."""
     found = np.zeros(len(probes.id))
     found[points.find(probes.id)[0]] = 1.0
     missing = np.flatnonzero(over_all(comm, found) == 0)
@@ -74,13 +76,13 @@ def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> 
 
 
 def _same(a: Body, b: Body) -> bool:
-    """Return whether two bodies have the same points."""
+    """Return whether two bodies have the same material points."""
     equal = len(a) == len(b) and a.dim == b.dim
     return a is b or (equal and all(np.array_equal(a.lower_of(p), b.lower_of(p)) for p in in_chunks(len(a))))
 
 
 def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
-    """Return reference positions of probes as an array (m, d), m."""
+    """Return the reference positions of probes as an array (m, d), m."""
     allowed = f"positions of {dim} finite coordinates"
     x = np.atleast_2d(numbers("probes: x0", x0, None, allowed=allowed))
     if x.shape[1:] != (dim,):
@@ -89,25 +91,24 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 
 
 def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
-    """Return probes: material particles that a run records, the `probes` of `Simulation.run`.
+    """Return probes: material particles at which a run records results, for `probes` of `Simulation.run`.
 
-    A run records displacement and position, with fluid also the pore pressure, and the effective stress on request; see
-    `Row`.
+    A run records displacement and position, with fluid also the pore pressure, and on request the stress; see `Row`.
 
     Parameters
     ----------
     bodies
-        All bodies of the scene, in its order.
+        All bodies of the scene, in the same order.
     x0 : (m, d), m
-        Reference positions, before a map, inside or on the surface of the bodies.  On a common surface of two bodies
-        the first one owns the probe; move the position slightly to select the other.
+        Reference positions, before the map of `mapped`, inside or on the surface of the bodies.  A probe on a common
+        surface of two bodies belongs to the first; move the position slightly to select the other.
     stress
-        Record the effective stress too.
+        Whether to record the effective stress too.
 
     Raises
     ------
     ValueError
-        A position outside the bodies.  A run raises it for other bodies than the scene's, or an absent body.
+        A position is outside the bodies.  A run raises it for bodies that are not the scene's, or absent.
     """
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)
@@ -124,7 +125,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
 def _domains_at(
     bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield the points whose domains contain a position x (d,), m, in order, with its local coordinates."""
+    """Yield the points with a domain that contains x (d,), m, in order, and the local coordinates of x."""
     start = 0
     for body in bodies:
         for part in in_chunks(len(body)):
@@ -138,13 +139,13 @@ def _domains_at(
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the local coordinates (n, d), in [-1, 1], of a position x (d,), m, in domains (n, 2^d, d), m."""
+    """Return the local coordinates (n, d), in [-1, 1], of a position x (d,), m, in domains with corners (n, 2^d, d)."""
     signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
     for _ in range(20):  # Newton's method; the first step is exact for parallelepipeds
         hats = 0.5 * (1 + signs * xi[:, None, :])
         dN = np.stack([0.5 * signs[:, a] * np.delete(hats, a, axis=2).prod(axis=2) for a in range(len(x))], axis=2)
         slope, off = np.einsum("nkd,nka->nda", corners, dN), x - interpolate(corners, xi)
-        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain a solution may not exist
+        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain a solution need not exist
         xi = np.clip(xi + step, -2.0, 2.0)
         if np.abs(step).max(initial=0.0) < ROUND_OFF:
             break

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The simulation, its time loop, and its analyses."""
+"""The simulation, its time loop, and analyses of a scene."""

@@ -20,24 +20,24 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Accuracy of the time of an event, relative to the step. Source: the documented accuracy of `until`."""
+"""Accuracy of the time of an event, relative to the step. Source: definition, the documented accuracy of `until`."""
 
 Event = Callable[[Any], float]
-"""A number or a truth value, as a function of the simulation."""
+"""A number or a boolean, as a function of the simulation."""
 
 
 class Simulated(Protocol):
-    """A `Simulation`, whose `state` is replaced."""
+    """A `Simulation`; `state` is replaced as a whole."""
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and the report of the step."""
+        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
 
 
 class Step(NamedTuple):
-    """A completed step: its start, its length, s, and its substeps if they differ from the scene's."""
+    """A completed step: state at the start, length, s, and substeps if they differ from the scene's."""
 
     start: State
     dt: float
@@ -45,7 +45,7 @@ class Step(NamedTuple):
 
 
 class Found(NamedTuple):
-    """An event: its number, length of the step to it, s, state at its end, and report of the step."""
+    """An event: index of its function, time from the start of the step, s, state and report at the event."""
 
     number: int
     dt: float
@@ -61,8 +61,8 @@ class Events:
     simulation
         Simulation at the start of the run.
     until
-        Functions of the simulation, or one. A number triggers an event where its sign changes, a truth value where it
-        turns true.
+        One function of the simulation, or several. An event occurs when a returned number changes sign within a step,
+        or when a returned boolean becomes True.
 
     Raises
     ------
@@ -78,11 +78,11 @@ class Events:
             self._values()
 
     def within(self, step: Step, new: State) -> Found | None:
-        """Return the first event within a step to the state `new`; None without an event.
+        """Return the first event within a step that ends in the state `new`; None without an event.
 
-        Trial steps of other lengths start from the same state: by Brent's method for numbers, by bisection for truth
-        values. The result is the first state after the event among them, at most `LOCATED` of the step after it. The
-        simulation is left in the state at the start of the step, even after an error.
+        Trial steps of other lengths start from the same state: by Brent's method for numbers, by bisection for
+        booleans. The result is the first of their states after the event, at most the fraction `LOCATED` of the step
+        later. The simulation then has the state at the start of the step again, even after an error.
         """
         if not self._until:
             return None
@@ -106,11 +106,11 @@ class Events:
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
         end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
         self._simulation.state = step.start
-        new, report = self._simulation.advanced(end, *step.how)  # even if tried before: the scene keeps data of it
+        new, report = self._simulation.advanced(end, *step.how)  # again: the scene keeps data of its last step
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
-        """Return the values at the end of a step of another length, s, and keep them in `tried`."""
+        """Return the values at the end of a step of length dt, s, and store them in `tried`."""
         if dt not in tried:
             self._simulation.state = step.start
             new, _ = self._simulation.advanced(dt, *step.how)
@@ -119,7 +119,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the functions, truth values as 1 or -1; raise errors of one process on all."""
+        """Return the values of the functions, booleans as 1 or -1; an error of one process is raised on all."""
         comm = self._simulation.scene.grid.comm
         out = []
         error = None
@@ -131,7 +131,7 @@ class Events:
         if error is not None:
             raise error
         if where:
-            raise RuntimeError(f"until: has raised an error on {where}")
+            raise RuntimeError(f"until: a function raised an error on {where}")
         given = comm.allgather(out)
         for rank, other in enumerate(given):
             if other != given[0]:
@@ -140,13 +140,13 @@ class Events:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return the functions with another sign than at the start of a step; a zero at the start never counts."""
+    """Return which values have another sign than at the start of a step; a zero at the start is no event."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 
 
 def _number(k: int, value) -> float:
-    """Return the value of a function as a number; truth values are 1 or -1."""
+    """Return the value of a function as a number; booleans are 1 or -1."""
     if isinstance(value, (bool, np.bool_)):
         return 1.0 if value else -1.0
     try:

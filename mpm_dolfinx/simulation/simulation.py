@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A scene and its state: input, stages and steps, and results."""
+"""Scene and state of a simulation: input, stages, steps and results."""
 
 from __future__ import annotations
 
@@ -31,59 +31,58 @@ from mpm_dolfinx.simulation import summary
 from mpm_dolfinx.simulation.tangent import tangent
 from mpm_dolfinx.simulation.timeloop import run
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
-from mpm_dolfinx.stepping.initial_state import balanced
+from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked
-from mpm_dolfinx.stepping.stage_changes import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 
 
 class Simulation:
-    """A scene and its state.
+    """A simulation: a scene and its state.
 
     Parameters
     ----------
     grid, bodies
         Background grid, and seeded bodies.
     materials
-        Materials, by the indices in the bodies.
+        Materials; bodies refer to them by index.
     walls
         Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the displacement
         components that they fix, such as {"left": "xy", "bottom": "y"}.
     conditions
         Conditions on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
-        `Inflow` on their sides, rigid `Tool`s, and `Contact`s of groups of bodies. Other sides are free and no-flow.
+        `Inflow` on their sides, rigid `Tool`s, and `Contact`s of groups of bodies. Other sides are free and sealed.
     fluid
-        Pore fluid; None for a dry scene, without the storage problem.
+        Pore fluid; None for a dry scene.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity; in axisymmetry along the axis.
     pressure
-        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`; needs a fluid.
+        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`; with fluid only.
     initial_stress
         Initial effective stress, tension positive: `K0`, a function of positions x (n, d) that returns normal stresses
         (n, 3) or tensors (n, 3, 3), Pa, or one of these for some bodies, {index: ...}. Fills start without stress
-        unless they are listed. The stress is balanced with the loads at the start, at the given pore pressures: nothing
-        moves in a first step under constant loads.
+        unless they are listed. At the start the stress is balanced with the loads, at the given pore pressures: under
+        constant loads the first step then causes no displacement.
     terms
-        User-defined terms in UFL: functions for the balance of momentum, see `user_functions`, such functions on a
-        side, `OnSide`, and terms in the storage of fluid, `Source`.
+        User-defined terms in UFL: functions for the balance of momentum, see `user_functions`; such functions on a
+        side, `OnSide`; and terms in the storage of fluid, `Source`.
     later
-        Indices of bodies that a later stage adds, each once.
+        Indices of bodies that are absent until a stage adds them, each once.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls. False: quasi-static at first; a later stage may switch inertia on.
-        None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
+        True: bodies have inertia, and need no walls. False: quasi-static; a later stage may switch inertia on. None:
+        quasi-static in all stages. Inertia excludes `quadrature="point"`.
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
         Initial velocity of bodies with inertia, or a function of position; by default zero.
 
     Attributes
     ----------
     state
-        The complete state between two steps (`State`). It is replaced as a whole at the end of a step. An error within
-        a step, Ctrl-C included, leaves it unchanged, and the next `run` continues from it.
+        The complete state between two steps (`State`). It is replaced as a whole at the end of a step. If an error or
+        Ctrl-C stops a step, the state is unchanged, and the next `run` continues from it.
     scene
         Grid, bodies and materials, with the compiled forms.
 
@@ -143,7 +142,7 @@ class Simulation:
         """Time for compiling or loading the forms, s."""
 
     def __str__(self) -> str:
-        """Return a table of the scene's terms and solvers, with the reason for each omitted one."""
+        """Return a table of the scene's terms and solvers, with the reason for each that is absent."""
         return summary.table(self.scene, self.state)
 
     # ---- results --------------------------------------------------------------------------------
@@ -174,48 +173,47 @@ class Simulation:
 
     @property
     def result(self) -> Result | None:
-        """Histories of the last run, or of the present one."""
+        """Histories of the last run, or of the run in progress."""
         return self.state.result
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
-        """The active conditions, as they were given."""
+        """Conditions of the present stage, as they were given."""
         return tuple(self.state.stage.given.values())
 
     @property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain).
+        """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain), in the last step.
 
-        In axisymmetry over the full circumference; the radial one sums outward forces. Of the last step; nan before the
-        first step of a stage.
+        In axisymmetry for the full circumference, radial forces outward; nan before the first step of a stage.
         """
         return self.outcome("reactions")
 
     @property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it fixes nothing.
+        """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero for free components.
 
-        Where two walls fix a component of a node, it counts once: for the wall normal to it, else half for each.
+        At a node where two walls fix the same component, it counts for the wall normal to it, else half for each.
         """
         return self.outcome("wall_reactions")
 
     @property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow through each drained side and inflow, by name, m^3/s (m^2/s in plane strain)."""
+        """Outflow through each drained side and each side with inflow, by name, m^3/s (m^2/s in plane strain)."""
         return self.outcome("outflows")
 
     @property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Force and moment (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by name."""
+        """Force, N, and moment, N m, (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by name."""
         return self.outcome("tool_forces")
 
     @property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement of each load-controlled `Tool` beyond its prescribed displacement, by name, m."""
+        """Displacement of each load-controlled `Tool`, without its prescribed displacement, by name, m."""
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return outcomes of conditions at the end of the last step, by name; also of user-defined conditions."""
+        """Return results of conditions, also of user-defined ones, at the end of the last step, by name."""
         return ByName(self.state.outcome.get(quantity, {}))
 
     @property
@@ -226,16 +224,16 @@ class Simulation:
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points.
 
-        In axisymmetry it is (n, 3, 3), in the radial, axial and hoop directions. The call is collective.
+        In axisymmetry it is (n, 3, 3), in the radial, axial and hoop directions. All processes must call it.
         """
         return self.scene.materials.effective_stress(self.state.points)
 
     def point_fields(self) -> PointFields:
-        """Return stresses, p', q and porosity of the points, see `PointFields`; the call is collective."""
+        """Return stresses, p', q and porosity of the points, see `PointFields`; all processes must call it."""
         return point_fields(self.scene, self.state.points)
 
     def cells(self) -> CellFields:
-        """Return centroids and fields of the cells, see `CellFields`; the call is collective."""
+        """Return centroids and fields of the cells, see `CellFields`; all processes must call it."""
         return cell_fields(self.scene, self.state)
 
     # ---- stages and steps -----------------------------------------------------------------------
@@ -254,46 +252,46 @@ class Simulation:
     ) -> None:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        Stresses and pressures are kept. The next `run` finds the new equilibrium: at once, or gradually under varying
-        loads.
+        Stresses and pressures are unchanged. The next `run` finds the new equilibrium: in its first step, or gradually
+        under loads that vary with time.
 
         Parameters
         ----------
         walls, gravity
-            As for the scene; `gravity` only if the scene had it.
+            As for the scene; `gravity` only if the scene has gravity.
         inertia
-            Whether bodies have inertia from now on; only if the scene allows it. Bodies then start at rest.
+            Whether bodies have inertia from now on; only if the scene allows it. Bodies then start without velocity.
         conditions
-            All conditions from now on; by default the active ones stay. `[*simulation.conditions, more]` adds one.
-            Contacts always stay, named or not.
+            All conditions from now on; by default the present ones. `[*simulation.conditions, more]` adds one. Every
+            `Contact` remains, whether listed or not.
         add
-            Indices of bodies in `later`: a fill, at rest and without stress. It is placed on the present surface of the
-            bodies that it touched when seeded; its opposite side stays at its seeded position.
+            Indices of bodies in `later`: a fill, without velocity and stress. It is placed on the present surface of
+            the bodies that it touched when seeded; its opposite side remains at its seeded position.
         remove
-            Indices of bodies to remove: an excavation.
+            Indices of bodies to be removed: an excavation.
         reset_displacement
-            Measure displacements from the present positions. Conditions that stay are not changed: a `Displacement`
-            then counts from there too, and moves its side once more.
+            Whether displacements are measured from the present positions. Conditions that remain are unchanged: a
+            `Displacement` then also starts from the present positions, and moves its side once more.
         fields
-            New values (n, ...) at this process's points, or one for all, of entries of `points.data`: constants of
-            materials that vary in space, state of laws, or new data of the user, which the points then carry.
+            New values of entries of `points.data`, (n, ...) at this process's points, or one for all points: constants
+            of materials that vary with position, state of laws, or new data of the user, which the points then store.
 
         Raises
         ------
         ValueError
-            Invalid input; the scene is unchanged.
+            The input is invalid; the scene is unchanged.
         """
         given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": inertia}
         named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
     def step(self, dt: float) -> Report:
-        """Advance by dt (s), > 0; return the report of the step.
+        """Advance by a step of dt, s, > 0; return the report of the step.
 
         Raises
         ------
         NotConverged, LeftGrid
-            The step fails; a shorter one may succeed.
+            The step fails; a shorter step may succeed.
         ValueError
             A function of time returns an invalid value.
         """
@@ -301,7 +299,7 @@ class Simulation:
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
-        """Return the state after a step of dt (s), and its report; how: other substeps. The state is unchanged."""
+        """Return the state after a step of dt, s, and its report; `state` is unchanged; how: other substeps."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
             return step(self.scene, self.state, dt, *how)

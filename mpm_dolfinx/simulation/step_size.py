@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Lengths of the steps of a run: equal steps, or adaptive steps from their estimated error.
+"""Length of the steps of a run: equal steps, or adaptive steps from their estimated error.
 
-The estimates are `note_pressures` in `solve/newton.py`, `filling` in `flow/storage.py` for the water content, and
-`dynamics/motion_error.py`.
+The errors are estimated in `note_pressures` of `solve/newton.py`, in `filling` of `flow/storage.py` for the water
+content, and in `dynamics/motion_error.py`.
 """
 
 from __future__ import annotations
@@ -25,46 +25,46 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.step_memory import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Smallest cut step relative to the nominal step: equal steps, adaptive steps.
+"""Smallest reduced step relative to the nominal step: for equal steps, for adaptive steps.
 
-Adaptive steps grow over decades; at the onset of sliding they must shrink to its time scale.
+Adaptive steps grow over decades. At the onset of sliding they must shrink to the time scale of sliding.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step relative to the time: bodies that burst would need ever smaller steps.
+"""Smallest adaptive step relative to the time; at a singularity in time steps would become ever smaller.
 
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""The next adaptive step is SAFETY over a root of the relative error, in SHRINKS to GROWS; below KEEPS it is unchanged.
+"""The next adaptive step is SAFETY / (a root of the relative error), in SHRINKS to GROWS; below KEEPS it is unchanged.
 
 Source: Hairer, Norsett and Wanner (1993), eq. 4.13; the last Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
 """Sudden pressure change, relative to the largest change so far, above which two halves replace a step.
 
-The stability function is never below -0.21: an undetected jump overshoots by a thousandth.
+The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""Sudden change, relative to the previous step's at the same rate, up to which it does not count as a jump."""
+"""Ratio of sudden changes in successive steps, at equal rates, up to which a change is no jump."""
 MOST = SAME / EPSILON
-"""Most output intervals. Source: exact bound; with more, the tolerance SAME of a step is below epsilon times t."""
+"""Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
-"""Smallest `rtol` in units of the solver's tolerance: smaller errors disappear in the solver's."""
+"""Smallest `rtol` / solver tolerance; with a smaller `rtol` solver errors would hide the error of the step."""
 FIRST = 1e-3
 """Smallest first adaptive step, relative to the first output interval."""
 
 
 @dataclass(frozen=True)
 class StepSize:
-    """The rule for the length of a run's steps.
+    """Rule for the length of a run's steps.
 
     Parameters
     ----------
     first, longest : s
-        First step; equal step, or longest adaptive step.
+        First step; length of equal steps, or of the longest adaptive step.
     rtol
         Tolerance of the pressure error, relative to the largest pressure change since the start of the run, or to the
-        undrained change of the step if larger; None: equal steps.
+        undrained pressure change of the step if that is larger; None: equal steps.
     """
 
     first: float
@@ -77,50 +77,50 @@ class StepSize:
         return self.rtol is not None
 
     def ended(self, t: float, target: float, control: StepControl) -> bool:
-        """Return whether a time, s, is the target up to rounding."""
+        """Return whether the time t, s, equals the target up to rounding."""
         slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(control.small, self.longest)
         return target - t <= slack
 
     def least(self, size: float, t: float) -> float:
-        """Return the smallest step, s, allowed at time t, s, for a nominal step, s."""
+        """Return the smallest step, s, at time t, s; size: nominal step, s."""
         return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
     def preferred(self, size: float) -> float:
-        """Return the nominal step, s, for `least`, from the first trial step, s."""
+        """Return the nominal step, s, for `least`; size: first trial step, s."""
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, adjusted to end a step at the output after `left`, s."""
-        if self.by_error:  # no tiny step before an output
-            small = min(small, self.longest)  # it may be longer if an earlier run had other steps
+        """Return the length of the next step, s: `small`, adjusted to the output time that follows after `left`, s."""
+        if self.by_error:  # avoids a tiny step before an output
+            small = min(small, self.longest)  # `small` may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
-        # steps that fit up to rounding all have the same length
+        # steps that fit up to rounding have equal lengths
         return left if not left > (1 - SAME) * small else small
 
     def refused(self, size: float, report: Report, control: StepControl) -> float:
-        """Return the factor by which a solved step must shrink to meet the error tolerance; 1 if it is accepted.
+        """Return the factor by which a solved step must be reduced to meet the error tolerance; 1 if it is accepted.
 
-        After a jump of the loads one long step overshoots by up to a fifth of the remaining change; two halves do not.
+        After a jump of the loads one long step overshoots by up to a fifth of the remaining change. Two halves do not.
         """
         if not self.by_error:
             return 0.5 if size > 0.75 * self.longest and self._rings(size, report, control) else 1.0
-        # most refused steps are at jumps or kinks of the loads, where the error is of first order
+        # most rejected steps are at jumps or kinks of the loads, where the error is of first order
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, size: float, report: Report, control: StepControl, failed: bool) -> float:
-        """Return the next trial step after a completed one, s; failed: whether a longer one had not converged."""
+        """Return the next trial step, s, after a completed one; failed: whether a longer step had not converged."""
         if not self.by_error:
-            grows = report.easy and not self._rings(size, report, control)  # twice the step would be refused
+            grows = report.easy and not self._rings(size, report, control)  # twice the step would be rejected
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
         factor = self._factor(report, control, 0.5)
         if factor >= 1:
-            # a step as long as a failed one mostly fails again: 78 cuts in place of 1 in soil that yields
+            # a step as long as a failed one mostly fails again: 78 reductions in place of 1 in yielding soil
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
-            return min(max(size * factor, control.small), self.longest)  # it may have been shortened for an output
+            return min(max(size * factor, control.small), self.longest)  # an output may have shortened the step
         return size * factor
 
     def cut(self, size: float, control: StepControl) -> StepControl:
-        """Return the step control with half a step, s, as the next trial, after a step without convergence."""
+        """Return the step control with half the step, s, as the next trial, after a step that did not converge."""
         whole = size > (1 - SAME) * control.small
         waits = 2 * control.waits + 1 if whole and control.kept == 0 else control.waits
         return replace(control, small=size / 2, waits=waits, kept=1)
@@ -128,9 +128,9 @@ class StepSize:
     def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
         """Return the step control with the next trial step after a completed step, s; failed: see `next`.
 
-        Equal steps grow at once after a cut, until a newly grown step fails too. They then wait for one more step, for
-        three, seven and so on. Half the wait remains when a newly grown step converges. `waits` is this number; `kept`
-        counts the steps since the last cut or growth: 0 directly after growth.
+        Equal steps grow at once after a reduction, until a newly grown step fails too. Then they grow after one more
+        step, after three, seven and so on. When a newly grown step converges, this number is halved. `waits` is the
+        number of steps to wait. `kept` counts the steps since the last reduction or growth: 0 directly after growth.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
@@ -138,27 +138,32 @@ class StepSize:
         waits = control.waits // 2 if whole and control.kept == 0 else control.waits
         if small > (1 + SAME) * control.small and control.kept > waits:  # beyond rounding
             return replace(control, small=small, waits=waits, kept=0)
-        # a step fitted to an output says nothing about longer ones
+        # a step shortened for an output is no evidence about longer steps
         return replace(control, waits=waits, kept=control.kept + whole)
 
     def _rings(self, size: float, report: Report, control: StepControl) -> bool:
-        """Return whether a step may have overshot a jump.
+        """Return whether a step may have overshot a jump of the loads.
 
-        A step leaves at most a fifth of a jump of the loads. A change that is equally sudden in successive steps is
-        therefore no jump. An edge pushed into a body causes such changes: the grid is reset in every step.
+        A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
+        jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
         """
         return report.sudden - AGAIN * control.first * size > RINGS * control.change
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the length of a step with the tolerated error, relative to a solved step."""
+        """Return (length of a step with the tolerated error) / (length of the solved step)."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return the error of a step over its tolerance: the largest ratio for pressure, motion and water content."""
+        """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content.
+
+        The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
+        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent, does
+        not fall with the step.
+        """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
-        allowed = self._allowed(report, control)
+        allowed = self.rtol * max(control.change, report.sealed)
         wrong, filled = report.fills
         errors = [
             (report.error, allowed),
@@ -166,14 +171,6 @@ class StepSize:
             (wrong, self.rtol * max(control.filled, filled)),
         ]
         return max(off / least if least > 0 else 0.0 if off == 0 else inf for off, least in errors)
-
-    def _allowed(self, report: Report, control: StepControl) -> float:
-        """Return the tolerance of the pressure error in a step, Pa.
-
-        The undrained pressure change counts because freely draining pressures follow the motion. Their error from the
-        time step affects no motion, and the grid's error, some percent, does not fall with the step.
-        """
-        return self.rtol * max(control.change, report.sealed)
 
 
 def measured(control: StepControl, report: Report, result: Result) -> StepControl:
@@ -186,21 +183,21 @@ def measured(control: StepControl, report: Report, result: Result) -> StepContro
 
 
 class Times:
-    """The output times of a run.
+    """Output times of a run.
 
     Parameters
     ----------
     start, now : s
-        Start of the run, and time from which it continues.
+        Start of the run, and time at which it begins or continues.
     end, interval, given, rtol
         t_end, dt, t_eval and rtol of `run`.
     goes_on
-        Whether the run continues histories.
+        Whether the run continues histories of an earlier run.
 
     Raises
     ------
     ValueError
-        An invalid argument, no time left, or more steps than floating-point times can resolve.
+        An argument is invalid, no time is left, or there are more steps than floating-point times can resolve.
     """
 
     def __init__(self, start: float, now: float, end, interval, given, rtol, goes_on: bool):
@@ -208,13 +205,13 @@ class Times:
         test, allowed = lambda v: (v >= least) & (v < inf), f"{more} {now:g} s and finite"
         self.end = float(numbers("t_end", end, allowed=allowed, test=test))
         if interval is None and rtol is None:
-            raise ValueError("dt = None: must be given, or rtol for steps that are chosen by their error")
+            raise ValueError("dt = None, must be given, or rtol for adaptive steps")
         if given is not None and interval is not None and rtol is not None:
             raise ValueError(
                 f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, s, 0 without one; whether every step is an output."""
+        """Output interval, s, 0 without an interval; whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731
@@ -230,22 +227,22 @@ class Times:
         self.start = start
 
     def after(self, t: float) -> list[float]:
-        """Return the output times after a time, s, the end included."""
+        """Return the output times later than time t, s, including the end of the run."""
         if self._times is not None:
             return [*(time for time in self._times if t < time < self.end), *([self.end] if t < self.end else [])]
-        # a last fraction of dt counts as an interval
+        # the last interval may be a fraction of dt
         start, dt = self.start, self.interval
         done = round((t - start) / dt)
         count = max(done + (self.end - t > SAME * dt), round((self.end - start) / dt))
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest time, s, that an interrupted run may have reached after the output time t."""
+        """Return the latest time, s, that an interrupted run may have after its output at time t, s."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time of pressure diffusion through a cell, h^2 / c_v, s; 0 without conductivity."""
+    """Return the least time for pressure diffusion through a cell, h^2 / c_v, s; 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -259,7 +256,7 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def cell_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least travel time of waves through a cell, s."""
+    """Return the least time for waves to cross a cell, s."""
     density = scene.materials.density(points)
     at = density > 0
     grid = scene.grid
@@ -270,24 +267,24 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:
-    """Return the step rule of a run, see `run`; ValueError for invalid arguments."""
+    """Return the rule for the steps of a run, see `run`; ValueError for invalid arguments."""
     positive = {"test": lambda v: v > 0, "allowed": "> 0"}
     if rtol is None:
         for name, value in {"first_step": first_step, "max_step": max_step if max_step != inf else None}.items():
             if value is not None:
-                raise ValueError(f"{name} = {line(value)}: needs rtol, for steps that are chosen by their error")
+                raise ValueError(f"{name} = {line(value)}, must be given with rtol, for adaptive steps")
         return StepSize(times.interval, times.interval)
     least = RESOLVED * scene.scheme.tolerance
-    numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
+    numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1), >= {RESOLVED} tolerance")
     if scene.numerics.method == "backward-euler":
-        raise ValueError(f"rtol = {line(rtol)}: backward-euler has no error estimate, must be sdirk2")
+        raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
-        raise ValueError(f"rtol = {line(rtol)}: without flow there is no error estimate for velocities, must be dt")
+        raise ValueError(f"rtol = {line(rtol)}: without flow velocities have no error estimate, must be dt alone")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
-    if len(scene.substeps) > 1:  # without time derivatives there is no error
+    if len(scene.substeps) > 1:  # a scene without time derivatives has no such error
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
     if inertia:  # for release or sudden loading

@@ -3,13 +3,13 @@
 
 A factor F divides cohesion, tensile strength and the tangents of the angles of friction and dilation (Griffiths and
 Lane 1999). Dilation is divided too, so that associated flow stays associated. Soil that is too weak has no equilibrium,
-but a solver without convergence says nothing about the soil. Each trial therefore advances in time against a viscous
-stress. The criterion is the overload: the viscous stress, as a fraction of the shear stress in the moving soil. In a
-body that comes to rest, the soil's strength takes over the load, and the overload vanishes. In a slide it stays: it is
-the missing strength, whatever the viscosity and the cell size.
+but a failure of the solver is no proof that the soil is too weak. Each trial therefore adds a viscous stress and
+follows the motion in time. The criterion is the overload: viscous stress / shear stress in the moving soil. If a body
+comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload remains: it is the
+missing strength, at any viscosity and cell size.
 
-All trials start from the stresses of soil with unlimited strength. Bodies at rest have such stresses. Bodies that were
-not run, because they cannot stand, reach them in an elastic step.
+All trials start from the stresses of soil with unlimited strength. Bodies in equilibrium have such stresses. Bodies
+that cannot stand, and were therefore not run, reach them in an elastic step.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.timeloop import run
+from mpm_dolfinx.stepping.initial_state import begin_stage
 from mpm_dolfinx.stepping.result import GaveUp
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage_changes import begin_stage
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 
@@ -45,19 +45,19 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors until one rests and one slides; largest ratio to 1."""
+"""Ratio of successive trial factors until bodies rest at one and slide at another; largest, or 1 / smallest, factor."""
 LACKS = 0.25
-"""Largest overload of a trial at rest, divided by `rtol`.
+"""Largest overload of a trial that comes to rest / `rtol`.
 
-A trial that slides starts at an overload of 0.9 of the missing strength in a uniform block, and of 0.6 in a slope. Its
-overload halves until the end. With 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
+A trial that slides starts with an overload of 0.9 of the missing strength in a uniform block, and of 0.6 in a slope.
+The overload halves until the end. With 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, in elastic strains at yield; in overloads at most.
+"""Strain in a trial of a marginal slide / elastic strain at yield, or / overload if the overload is smaller.
 
-Stresses of soil that begins to flow redistribute within a few strains at yield. In soft soil these would change the
-shape of the body: the viscosity is larger there. Half and twice as much change the factor of a slope by 0.5 %, twice
-the steps by less than 0.1 %.
+Stresses of soil that begins to flow redistribute within a few strains at yield. In soft soil such strains would change
+the shape of the body; the viscosity is larger there. Half and twice this number change the factor of a slope by 0.5 %,
+twice the number of steps changes it by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -65,16 +65,16 @@ ANGLES = ("friction", "dilation")
 
 @dataclass(frozen=True)
 class Safety:
-    """A factor of safety, and its trials.
+    """A factor of safety, with the results of its trials.
 
     factor
         Mean of the two bounds.
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Factor -> fraction of the shear stress in excess of the soil's strength, in each step of the trial (n,).
+        Overload in each step (n,), by trial factor: work of the viscous stress / work of the shear stress.
     newton
-        Newton steps of all trials.
+        Number of Newton steps of all trials.
     """
 
     factor: float
@@ -88,42 +88,45 @@ def factor_of_safety(
 ) -> Safety:
     """Return the factor of safety by strength reduction: the largest divisor of the strength without failure.
 
-    The simulation is unchanged. A scene that cannot stand needs no run: trials start from an elastic step of dt. The
-    call is collective. Suction, as part of the effective stress, is strength. Tool friction is not divided. The factor
-    of a thin weak layer at the surface depends on `rtol`: where it slides alone, its share of the load decides.
+    The simulation is unchanged. A scene that cannot stand need not be run: trials start from an elastic step of dt.
+    Suction, as part of the effective stress, is strength. Tool friction is not divided. If a thin weak layer at the
+    surface slides alone, the factor depends on `rtol`, by its share of the load. All processes must call the function.
 
     Parameters
     ----------
     simulation
-        Scene under its loads; functions of time must have become constant.
+        Scene under its loads, which must be constant in time from now on.
     dt
-        Length of a step, s, > 0: long compared with viscous time scales of laws and terms. It is required where fluid
-        flows: short for undrained, long for drained failure.
+        Length of a step, s, > 0: long compared with viscous time scales of laws and terms. With flow of fluid it is
+        required: short for undrained, long for drained failure.
     rtol
-        Final relative distance of the bounds, in [1e-4, 0.5].
+        Final relative difference of the bounds, in [1e-4, 0.5].
     steps
-        Most steps in a trial, >= 8; bodies slide if they have not come to rest by then.
+        Largest number of steps in a trial, >= 8; bodies that move after these steps slide.
     progress
-        Show a progress bar on a terminal.
+        Whether to show a progress bar on a terminal.
 
     Returns
     -------
     Safety
-        The factor, its bounds and all trials.
+        The factor, its bounds and the overloads of all trials.
 
     Raises
     ------
     ValueError
-        An invalid argument; soil with a strength that cannot be divided; bodies without stress, that do not slide with
-        a sixteenth of their strength, or that do not come to rest with sixteen times as much.
+        An argument is invalid; a soil has a strength that cannot be divided; bodies have no stress.  Bodies do not
+        slide with 1/16 of their strength, or do not come to rest with 16 times their strength.
     GaveUp
-        A step of a trial does not converge, however short.
+        A step of a trial does not converge at any length.
     """
     if not isinstance(getattr(simulation, "scene", None), Scene):
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
     if simulation.state.stage.inertia:
         raise ValueError("factor_of_safety: bodies have inertia, must be quasi-static: stage(inertia=False)")
-    dt, steps = _step_of(simulation, dt), whole("steps", steps, 8)
+    if dt is None and simulation.scene.flows:
+        raise ValueError("dt = None: must be given where fluid flows: short for undrained, long for drained failure, s")
+    positive = {"allowed": "> 0 and finite", "test": lambda v: (0 < v) & (v < np.inf)}
+    dt, steps = float(numbers("dt", 1.0 if dt is None else dt, **positive)), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
     flag("progress", progress)
     comm = simulation.grid.comm
@@ -148,12 +151,12 @@ def factor_of_safety(
 
 
 class _Bar:
-    """A terminal line with the results of trials, and the progress of the present one."""
+    """A terminal line with the results of trials, and the progress of the current trial."""
 
     def __init__(self, shown: bool):
         self._bar = tqdm(bar_format="{desc}, {n_fmt} steps, {elapsed}{postfix}", disable=None if shown else True)
         self._bar.set_description("factor of safety")
-        self._logs = nullcontext() if self._bar.disable else logging_redirect_tqdm()  # messages above the line
+        self._logs = nullcontext() if self._bar.disable else logging_redirect_tqdm()  # log lines above the bar
         self._known = {"rests": "", "slides": ""}
 
     def __enter__(self) -> _Bar:
@@ -165,44 +168,33 @@ class _Bar:
         self._bar.close()
 
     def show(self, factor: float, count: int, overload: float) -> None:
-        """Show a step of a trial."""
+        """Show a step of a trial: factor, number of the step, overload."""
         self._bar.update()
         known = "".join(f", {what} at {at}" for what, at in self._known.items() if at)
         self._bar.set_postfix_str(f"strength over {factor:.4g}: step {count}, overload {overload:.1e}{known}")
 
     def tried(self, factor: float, judged: str) -> None:
-        """Note the result of a trial."""
+        """Store the result of a trial, "rests" or "slides", for the next lines."""
         self._known[judged] = f"{factor:.4g}"
 
 
 def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
-    """Return a factor at which bodies rest and a larger one at which they slide, from successive trials from 1 on."""
+    """Return a factor at which bodies rest and a larger one at which they slide; the first trial is 1."""
     known, wider = 1.0, WIDER if (begins := rests(1.0)) else 1 / WIDER
     while 1 / WIDEST <= (trial := known * wider) <= WIDEST:
         if rests(trial) != begins:
             return min(known, trial), max(known, trial)
         known = trial
-    found = "come to rest" if begins else "slide"
-    more = "" if begins else "; loads must be constant in time"
-    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor{more}")
-
-
-def _step_of(simulation: Simulation, dt: float | None) -> float:
-    """Return the length of a step, s."""
-    if dt is None and simulation.scene.flows:
-        raise ValueError("dt = None: must be given where fluid flows: short for undrained, long for drained failure, s")
-    return _positive("dt", 1.0 if dt is None else dt)
-
-
-def _positive(name: str, value: float) -> float:
-    return float(numbers(name, value, allowed="> 0 and finite", test=lambda v: (0 < v) & (v < np.inf)))
+    found, allowed = ("come to rest", "slide") if begins else ("slide", "come to rest")
+    allowed += " at some factor" if begins else " at some factor; loads must be constant in time"
+    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must {allowed}")
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
-    """Return whether the result of a trial is known from the overload of each step so far.
+    """Return whether the overloads of the steps so far determine the result of a trial.
 
-    The overload falls ever more slowly. A body therefore slides if, at the rate of the last step, it would not come to
-    rest in the remaining steps.
+    The overload falls ever more slowly. A body therefore slides if the last step's rate of decrease, continued, does
+    not bring it to rest in the remaining steps.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -211,7 +203,7 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """A trial as driven by the time loop; newton: list that receives the Newton steps of each step."""
+    """A trial that the time loop runs; newton: list to which each step appends its number of Newton steps."""
 
     scene: Scene
     state: State
@@ -225,7 +217,7 @@ class _Trial:
 
 
 class _Weakened:
-    """The scene of a simulation with strengths as point data, and a viscous stress; see `factor_of_safety`."""
+    """Copy of the simulated scene with strengths as point data, and a viscous stress; see `factor_of_safety`."""
 
     def __init__(self, simulation: Simulation, dt: float, steps: int, least: float):
         scene = simulation.scene
@@ -239,8 +231,8 @@ class _Weakened:
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
         if scene.grid.copies > 1:
-            raise ValueError("factor_of_safety: contacts: must be none")
-        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data of its grid
+            raise ValueError("factor_of_safety: the scene has contacts, must have none")
+        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data that belong to its grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
         def resistance(points, u, dt):
@@ -268,7 +260,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overload of each step (n,) until the result is known; tell: called with each step."""
+        """Return the overload of each step (n,) until the result is known; tell: function called after each step."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -278,29 +270,29 @@ class _Weakened:
         return np.array(out)
 
     def _unyielding(self, initial: State) -> State:
-        """Return the state after a step with soil that does not yield below strains of one."""
+        """Return the state after a step with soil whose strength exceeds its modulus: it does not yield."""
         moduli = self._scene.materials.table(initial.points, lambda m: m.oedometric)
         trial = self._trial(initial, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
         self._go_on(trial, "soil that cannot yield")
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state, with other strengths at its points."""
+        """Return a trial from the state `start`; strength: function of name and strengths (n,)."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
-        """Take a step; what: names the strength in an error message."""
+        """Take a step of a trial; what: description of the strength for an error message."""
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step, divided by the work of the shear stress, by magnitude.
+        """Return the work of the viscous stress in a step / work of the shear stress, both by magnitude.
 
-        Points that moved to another process are left out.
+        Points that moved to another process are excluded.
         """
         _, old, new = np.intersect1d(before.id, now.id, assume_unique=True, return_indices=True)
         d = before.F.shape[1]
@@ -315,12 +307,12 @@ class _Weakened:
 
 
 def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the deviators of tensors (n, 3, 3)."""
+    """Return the deviatoric parts of tensors (n, 3, 3)."""
     return tensors - np.trace(tensors, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress, Pa; refuse a stress within the rounding of coordinates."""
+    """Return the mean norm of the effective stress, Pa; ValueError if rounding of coordinates exceeds the stress."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -328,12 +320,12 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
     sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
     total, rounding, whole_volume = over_all(grid.comm, sums)
     if not total > rounding:
-        raise ValueError("factor_of_safety: the bodies have no stress, must be at rest under loads")
+        raise ValueError("factor_of_safety: the bodies have no stress, must be in equilibrium under loads")
     return float(total / whole_volume)
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of the shear moduli of soil with a strength, Pa: soft soil flows first."""
+    """Return the harmonic mean of the shear moduli, Pa, of soil with a strength: soft soil flows first."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
@@ -341,7 +333,7 @@ def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _of(m: Skeleton) -> list[str]:
-    """Return the names of a material's constants that are divided."""
+    """Return the names of the constants of a material that the factor divides."""
     if not isinstance(m, Frictional):
         return []
     own = {f.name for f in fields(m)} & set(STRENGTHS)
@@ -349,7 +341,7 @@ def _of(m: Skeleton) -> list[str]:
 
 
 def _as_fields(m: Skeleton) -> Skeleton:
-    """Return a material with its strengths as point data."""
+    """Return a material with its strengths as functions of position, so that they are point data."""
     carried = {name: partial(_constant, value=getattr(m, name)) for name in _of(m) if not callable(getattr(m, name))}
     if isinstance(m, Frictional) and m.symmetric:
         carried |= {"dilation": carried.get("friction", m.friction)}
@@ -361,7 +353,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the strengths of the points, name -> (n,), zero for materials without a strength of that name."""
+    """Return the strengths of the points, name -> (n,); zero for materials without this strength."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)
@@ -372,5 +364,5 @@ def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.flo
 
 
 def _over(name: str, value: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
-    """Return a strength over a factor."""
+    """Return a strength divided by a factor, for angles by the tangent."""
     return np.degrees(np.arctan(np.tan(np.radians(value)) / factor)) if name in ANGLES else value / factor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summary of a scene: its terms and solvers, reasons for omitted ones, and its distribution over processes."""
+"""Summary of a scene: its terms and solvers, reasons for absent ones, and its distribution over processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mpm_dolfinx.stepping.state import State
 
 @dataclass(frozen=True)
 class Part:
-    """A term or solver: its name, whether the scene has it, and its form or the reason for its omission."""
+    """A term or solver: name, whether the scene has it, and its form or the reason for its absence."""
 
     name: str
     used: bool
@@ -29,7 +29,7 @@ class Part:
 
 
 def parts(scene: Scene, state: State) -> list[Part]:
-    """Return the terms and solvers of a scene at present; some are compiled only when they are needed."""
+    """Return the terms and solvers of a scene at present; some are compiled only when a step needs them."""
     return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
 
 
@@ -108,16 +108,16 @@ def _one_substep(s: Scene) -> str:
 
 
 def table(scene: Scene, state: State) -> str:
-    """Return the parts of a scene as a table."""
+    """Return the terms and solvers of a scene as a table."""
     rows = parts(scene, state)
     width = max(len(part.name) for part in rows)
     return "\n".join(f"{part.name:{width}}  {'yes' if part.used else 'no ':3}  {part.why}" for part in rows)
 
 
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
-    """Return the largest number on a process over the mean of all: points, pieces, active cells; after the first step.
+    """Return largest number on a process / mean number, for points, pieces and active cells; after the first step.
 
-    1 is perfect; the time of a step is proportional to the pieces. The call is collective.
+    1 means perfect balance; the time of a step is proportional to the pieces. All processes must call it.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The tangent of both balances at the present state as sparse matrices, for modes and sensitivities."""
+"""Tangent of both balances at the present state as sparse matrices, for modes and sensitivities."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 from petsc4py import PETSc
 
@@ -14,29 +13,29 @@ from scipy.sparse import csr_matrix
 
 from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.simulation.events import Simulated
 from mpm_dolfinx.stepping.balances import balances
-from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import set_up
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """Derivatives of the residuals by displacements (n,), m, and pressures (m,), Pa, for a step by backward Euler.
+    """Derivatives of the residuals with respect to displacements and pressures, for a step by backward Euler.
 
-    Forces change by `stiffness` du + `pressure` dp, N; fluid contents by `content` du + `storage` dp, m^d. In plane
-    strain both are per metre of thickness. Blocks of pressures are None without fluid.
+    Forces change by `stiffness` du + `pressure` dp, N, and fluid contents by `content` du + `storage` dp, m^d, for du
+    (n,), m, and dp (m,), Pa; in plane strain per metre of thickness. Blocks of the pressures are None without fluid.
 
     Parameters
     ----------
     stiffness : (n, n)
-        Stiffness, with penalties: ghost penalty, prescribed displacements, contacts. Fixed displacements are left out.
+        Stiffness, with ghost penalty and penalties of prescribed displacements and contacts; without fixed components
+        and without the inertia of bodies. Free tools move with the bodies, against their own inertia.
     nodes, components : (n,)
-        Node of the grid and axis of each displacement.
+        Grid node and axis of each displacement.
     x : (n, d)
-        Position of the node, m.
+        Position of the node of each displacement, m.
     pressure, content, storage : (n, m), (m, n), (m, m)
-        Blocks of the pressures, without the derivative of fluxes with respect to displacements.
+        Blocks with pressures, without the derivative of fluxes with respect to displacements.
     cells : (m,)
         Cell of each pressure.
     """
@@ -51,15 +50,8 @@ class Tangent:
     cells: NDArray[np.int64] | None = None
 
 
-class Simulated(Protocol):
-    """An object with a scene and a state."""
-
-    scene: Scene
-    state: State
-
-
 def tangent(simulation: Simulated, dt: float) -> Tangent:
-    """Return the tangent at the present state, at the start of a step of dt (s), > 0; see `Tangent`.
+    """Return the tangent at the present state; dt: length of the step that starts now, s, > 0; see `Tangent`.
 
     Raises
     ------
@@ -71,7 +63,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     if scene.grid.comm.size > 1:
         raise ValueError(f"tangent: has matrices of one process, not of {scene.grid.comm.size}")
     start = set_up(scene, state, dt)
-    acting = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
+    acting = start.begun(start.acting[-1]._replace(substep=METHODS["backward-euler"][0]), None)
     both = balances(scene, start, acting)
     momentum, storage = both.momentum, both.storage
     momentum.assemble_residual()

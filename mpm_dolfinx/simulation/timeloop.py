@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The time loop: steps, cut where they do not converge and grown again, and their histories."""
+"""Time loop: steps, reduced where they do not converge and grown again, and histories of a run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import replace
 from inspect import signature
 from logging import INFO, WARNING
 from math import inf
-from typing import Any, Protocol
+from typing import Any
 
 from mpi4py import MPI
 
@@ -21,15 +21,15 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, Report, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.time_integration import EULER, Substep
+from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
-from mpm_dolfinx.dynamics.energies import begun
+from mpm_dolfinx.dynamics.energies import initial_energies
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
-from mpm_dolfinx.simulation.events import Event, Events, Step
+from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
@@ -53,16 +53,6 @@ PARTS = (
 
 Observer = Callable[[Any], None]
 """A function of the simulation."""
-
-
-class Simulated(Protocol):
-    """The object that the time loop drives: a `Simulation`, whose `state` it replaces."""
-
-    scene: Scene
-    state: State
-
-    def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
 
 
 def run(
@@ -89,45 +79,45 @@ def run(
     Parameters
     ----------
     t_end
-        End time, s, not a duration: > t.
+        End time, s, > t (not a duration).
     dt
-        Step and output interval, s, > 0; a longer one is cut to t_end. With `rtol` it is the output interval only;
-        without it and `t_eval` every step is an output.
+        Step and output interval, s, > 0, at most t_end - t. With `rtol` it is only the output interval. With `rtol`,
+        and neither `dt` nor `t_eval`, every step is an output.
     rtol
         Choose the steps by their error. The estimated error of the pore pressures stays below about `rtol` times the
-        larger of two changes: the largest since the start of the run, and the undrained change of the step. At least
-        ten times `tolerance`, and < 1. Without flow the steps are the output intervals, and terms with the velocity are
-        refused, because they have no error estimate. With inertia the error of the motion counts too, see
-        `motion_error`, relative to the largest motion since the start. In unsaturated soil so does the error of the
-        water content, relative to its largest change in a step so far. The estimate is a fraction of a first-order
-        step's error, see `solve.newton.ERROR`. True errors were 0.7 to 5 times as large, the latter directly after a
-        jump of the load.
+        larger of two changes: the largest since the start of the run, and the undrained change of the step. `rtol` is
+        at least ten times `tolerance`, and < 1. Without flow of fluid the steps are the output intervals; terms with
+        the velocity then raise ValueError, because they have no error estimate. With inertia the error of the motion
+        is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil the
+        error of the water content is limited too, relative to its largest change in a step so far. The estimate is a
+        fraction of a first-order step's error, see `solve.newton.ERROR`. True errors were 0.7 to 5 times the estimate;
+        the largest ratio occurs directly after a jump of the load.
     t_eval : (m,), s
-        Output times, increasing, in (t, t_end]; t_end is always one. Steps end at output times.
+        Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     first_step, max_step
         With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 20 rtol times
-        the diffusion time of a cell, and at least a thousandth of the first output interval.
+        the time for diffusion through a cell, and at least a thousandth of the first output interval.
     until
-        Functions of the simulation, or one, that end the run before t_end. An event is a change of sign of a number
-        within a step, or a truth value that turns true: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. A
-        condition that holds at the start is no event. Trial steps locate it: the run ends at the first state found
-        after the event, at most a thousandth of the step later. This state is an output; `Result.event` has number and
-        time. The values must be equal on all processes. Histories that ended at an event are complete, as at t_end; a
-        run without `until` continues them.
+        One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
+        number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
+        event. Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event:
+        the run ends at the first state found after it, at most a thousandth of the step later. This state is an output;
+        `Result.event` has the function's index and the time. Values must be equal on all processes. Histories that
+        ended at an event are complete, as at t_end; a run without `until` continues them.
     probes
-        Particles to record.
+        Material particles with recorded results.
     observe
-        Functions of the simulation, called at each output time, such as a `Writer`; `result` holds the histories so
-        far.
+        Functions of the simulation, called at each output time, such as a `Writer`; `result` then contains the
+        histories so far.
     checkpoint
-        Called after all observers: a `Checkpoint`.
+        Function called after all observers: a `Checkpoint`.
     after
-        Histories to continue, of a run with the same steps: from `resume`, or `result` of an interrupted run.
+        Histories to be continued, of a run with the same steps: from `resume`, or `result` of an interrupted run.
     energies
-        Record energies of bodies with inertia, and works from the start of the run: `Result.energies`.
+        Whether to record energies of bodies with inertia, and work since the start of the run: `Result.energies`.
     progress
-        Show a progress bar on a terminal, and warn of the first cut step. The logger `mpm_dolfinx` reports others as
-        INFO.
+        Whether to show a progress bar on a terminal, and to warn of the first reduced step. The logger `mpm_dolfinx`
+        reports the others at level INFO.
 
     Returns
     -------
@@ -136,10 +126,9 @@ def run(
     Raises
     ------
     ValueError
-        An invalid argument, or an invalid value of a function of time.
+        An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        A step failed, however short; the exception has the histories so far. `points` and `t` belong to the last good
-        step.
+        A step failed at any length; the exception has the histories so far. `points` and `t` are of the last good step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -182,7 +171,7 @@ def run(
                 _note(simulation, stopwatch.read(simulation.state.result))
                 checkpoint(simulation)
 
-    # messages appear above the bar
+    # messages are printed above the bar
     with bar, nullcontext() if bar.disable else logging_redirect_tqdm([logger] if logger.handlers else None):
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.control):
@@ -190,8 +179,8 @@ def run(
                 if _take_step(simulation, rule, target, progress, events):
                     output(True)
                     return _note(simulation, stopwatch.read(_measured(simulation)))
-                there = rule.ended(simulation.state.t, target, simulation.state.control)
-                if times.each and not there:
+                reached = rule.ended(simulation.state.t, target, simulation.state.control)
+                if times.each and not reached:
                     output(False)
                 _show(bar, simulation.state, before)
             simulation.state = replace(simulation.state, t=target)
@@ -200,7 +189,7 @@ def run(
 
 
 def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
-    """Refuse arguments that differ between processes, which would otherwise wait for each other."""
+    """Raise ValueError for arguments that differ between processes, which would otherwise wait for each other."""
     texts = comm.allgather([line(value) for value in given.values()])
     for k, name in enumerate(given):
         for rank, text in enumerate(texts):
@@ -210,13 +199,13 @@ def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
 
 
 def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
-    """Return a progress bar in time."""
+    """Return a progress bar for the time from start to end, s."""
     form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
     return tqdm(total=end - start, initial=now - start, bar_format=form, disable=None if shown else True)
 
 
 def _show(bar: tqdm, state: State, before: float) -> None:
-    """Update the progress bar."""
+    """Update the progress bar; before: time at the last update, s."""
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
@@ -231,7 +220,7 @@ def _note(simulation: Simulated, result: Result, control: StepControl | None = N
 
 
 def _takes_nothing(function: Callable) -> bool:
-    """Return whether a function takes no argument; False for built-in functions without a signature."""
+    """Return whether a function has no parameter; False for built-in functions without a signature."""
     try:
         return not signature(function).parameters
     except (TypeError, ValueError):
@@ -239,7 +228,7 @@ def _takes_nothing(function: Callable) -> bool:
 
 
 def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
-    """Call an observer; an error on one process is raised on all, so that none waits for the others."""
+    """Call an observer; an error on one process is raised on all, so that no process waits for the others."""
     raised = None
     try:
         observer(simulation)
@@ -249,13 +238,13 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
     if raised is not None:
         raise raised
     if where:
-        raise RuntimeError(f"observe: {line(observer)} has raised an error on {where}")
+        raise RuntimeError(f"observe: {line(observer)} raised an error on {where}")
 
 
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return new histories from the present state, or the histories to continue, and the step control."""
+    """Return new histories that start at the present state, or the histories to be continued, and the step control."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
@@ -265,50 +254,50 @@ def _histories(
         fresh = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), fresh
     if latest is None or control is None or after.rows.run is not latest.rows.run:
-        raise ValueError("after: histories of another run, must be of the last one, or a result of `resume`")
-    after = latest  # which may have advanced since
+        raise ValueError("after: histories of another run, must be histories of the last run, or a result of `resume`")
+    after = latest  # the run may have advanced since `after`
     now = state.t
     start = after.rows[0]
     last = after.rows[-1].t
-    # an interrupted run may be within its next interval
+    # an interrupted run may have stopped within its next interval
     if control.interval != times.interval or not last <= now <= times.next(last):
         what = f"dt = {times.interval!r} from t = {now!r}: the run to continue has dt = {control.interval!r}"
         raise ValueError(f"{what}, t = {last!r}; for other steps, or t_eval, start new histories, without after")
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
-        raise ValueError(f"probes: the run to continue has {recorded} of them")
+        raise ValueError(f"probes: {count} probes, must be {recorded}, as in the run to continue")
     if count and probes.stressed != (len(start.probe_stress) > 0):
         raise ValueError(f"probes: stress = {probes.stressed}, must be as in the run to continue")
     return after, control
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with new energies, with the energies of a continued run, or without."""
+    """Return the state with new energies, with the energies of the continued run, or without energies."""
     if energies and not state.stage.inertia:
         raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
-        outcome["energy"] = begun(scene.materials, state.points, state.stage.kinetic(outcome))
+        outcome["energy"] = initial_energies(scene.materials, state.points, state.stage.kinetic(outcome))
     return replace(state, outcome=outcome)
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including the times of the histories that it continues."""
+    """Wall time and profile of a run.  They include the times of the earlier run that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
         self._timed = {part: _compat.seconds[part] - result.profile.get(part, 0.0) for part in PARTS}
 
     def read(self, result: Result) -> Result:
-        """Return the histories with the times so far."""
+        """Return the result with the wall time and profile up to now."""
         profile = {part: _compat.seconds[part] - self._timed[part] for part in PARTS}
         return replace(result, wall=time.perf_counter() - self._start, profile=profile)
 
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
-    """Take one step towards the time target, s; return whether an event has ended the run."""
+    """Take one step towards the time `target`, s; return whether an event has ended the run."""
     step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
     if found is None:
@@ -323,7 +312,7 @@ def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bo
 def _accepted(
     rule: StepSize, start: State, size: float, new: State, report: Report, preferred: float | None = None
 ) -> State:
-    """Return the state after a step of length size, s, with its histories; preferred: the nominal step, s."""
+    """Return the state after a step of length `size`, s, with its histories; preferred: nominal step, s."""
     grown = measured(start.control, report, start.result)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
     grown = replace(grown, first=0.0 if new.stays else report.first / size)
@@ -331,9 +320,9 @@ def _accepted(
 
 
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
-    """Return a step towards the time target, s, and its end state; it is cut until it converges and is accurate.
+    """Return a step towards the time `target`, s, and its end state; the step is reduced until it meets its tolerances.
 
-    verbose: warn of the first cut of a run.
+    verbose: warn of the first reduced step of a run.
     """
     comm = simulation.scene.grid.comm
     preferred = None
@@ -376,9 +365,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
-    """Return the state after a step of dt (s) by backward Euler, and its report; None if it fails too.
+    """Return the state after a step of dt, s, by backward Euler, and its report; None if this step fails too.
 
-    After a jump of the loads the second substep of SDIRK2 overshoots, which soil may not bear.
+    After a jump of the loads the second substep of SDIRK2 overshoots. Soil may be too weak for this.
     """
     if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
         return None
@@ -393,14 +382,14 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid in an accurate step: shorter steps cannot prevent it."""
+    """Return whether points leave the grid in a step that is accurate: shorter steps cannot prevent this."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report, state.result)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
-    """Return the message of a run that gave up at t with a step `small`, s."""
+    """Return the message of a run that gave up at time t, s, after a step `small`, s."""
     if isinstance(failed, LeftGrid):
         return str(failed)
     why = "shorter steps help only where loads grow with time, as functions of t; the soil may have no equilibrium"
@@ -408,7 +397,7 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 
 
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
-    """Return the row of the histories for the present state."""
+    """Return the results at the present time, as one row of the histories."""
     scene, state = simulation.scene, simulation.state
     comm = scene.grid.comm
     d = scene.grid.dim
@@ -429,7 +418,7 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
 
 
 def _measured(simulation: Simulated) -> Result:
-    """Return the histories with memory and load balance of the processes."""
+    """Return the histories with the memory and the load balance of the processes."""
     comm, state = simulation.scene.grid.comm, simulation.state
     points, memory = comm.allreduce(np.array([len(state.points), peak_memory()])).tolist()
     even = imbalance(simulation.scene, state) if comm.size > 1 else {}

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Newton's method, the coupling of both balances, and linear solvers."""
+"""Newton's method, coupling of the two balances, and linear solvers."""

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Direct linear solvers, where they are better than multigrid (`multigrid`): see `plan`.
+"""Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
 
-PETSc's own factors of displacements, with a block for each node, take a third of the time of scalar factors. With 44000
-unknowns in 2D and minimum degree ordering they take 110 ms, 60 again with the same pattern (scalar 430 and 150; MUMPS
-260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290). A solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries
-into blocks takes a tenth of the factorisation. On two processes MUMPS takes as long, and 25 ms a solve. With a few
-processes, one therefore holds the factors of displacements that many solves use. Another holds the factors of
-pressures, made at the same time. Making both on all of four processes, which share the memory's bandwidth, took 1.7
-times as long.
+PETSc's own factors of displacement matrices, with a block for each node, take a third of the time of scalar factors.
+With 44000 unknowns in 2D and minimum degree ordering the first factorisation takes 110 ms, the next with the same
+pattern 60 ms (scalar 430 and 150; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290). A solve takes 4 ms
+(MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two processes MUMPS takes
+as long, and 25 ms for a solve. With few processes, one process therefore holds the factors of displacements, which many
+solves use. Another holds the factors of pressures, computed at the same time. With both factorised on all of four
+processes, which share the memory's bandwidth, the factorisations took 1.7 times as long.
 
-Large bodies need nested dissection. With 504000 unknowns in 2D, repeated factors take 3.0 s and 4.6e7 entries by grid
-lines, see `dissection`. PETSc's nested dissection takes 5.1 s and 5.0e7, minimum degree 6 to 12 s and 7.5e7 (MUMPS 6.2
-s and 5.3e7). With a tenth of the unknowns they take 80, 110, 120 ms; with fewer all are the same.
+Large bodies need nested dissection. With 504000 unknowns in 2D, repeated factors ordered by grid lines take 3.0 s and
+4.6e7 entries, see `dissection`. PETSc's nested dissection takes 5.1 s and 5.0e7, minimum degree 6 to 12 s and 7.5e7
+(MUMPS 6.2 s and 5.3e7). With a tenth of the unknowns they take 80, 110, 120 ms; with fewer unknowns the same time.
 
-These figures are with the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use. With OpenBLAS MUMPS takes a half
+These figures are for the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use. With OpenBLAS MUMPS takes a half
 to a third of the time.
 """
 
@@ -35,8 +35,8 @@ from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 MOST = 500
 """Largest number of iterations of a linear solve, and size of its Krylov space: there is no restart.
 
-With PETSc's restarts after 30, FGMRES stagnates where the tangent of a footing is nearly singular: solves that end
-after 500 iterations take 50. Vectors are allocated on demand.
+With PETSc's restarts after 30 iterations, FGMRES stagnates where the tangent of a footing is nearly singular: solves
+then end after 500 iterations, and take 50 without a restart. Vectors are allocated on demand.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
 
@@ -44,14 +44,14 @@ TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite pr
 def direct_solver(
     A: PETSc.Mat, name: str, symmetric: bool = True, gathered: bool = False, package: str | None = None
 ) -> PETSc.KSP:
-    """Return a solver that factorises A, a symmetric one as L D L^T, and again after A has changed.
+    """Return a solver that factorises A, and again after A has changed; symmetric: as L D L^T.
 
     Parameters
     ----------
     gathered
-        Whether one process, the last one, holds the factors; this suits many solves with one matrix.
+        Whether one process, the last one, holds the factors; this suits many solves with the same matrix.
     package
-        Package of the factorisation; None: PETSc, but MUMPS on several processes.
+        Package of the factorisation; None: PETSc on one process, MUMPS on several.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -67,7 +67,7 @@ def direct_solver(
             ksp.pc.setFactorSolverType(package)
         else:
             ksp.pc.setFactorOrdering("nd" if gathered else "amd")
-            ksp.pc.setFactorPivot(0.0)  # no limit: PETSc's 2e-14 refuses rows of nearly empty cells
+            ksp.pc.setFactorPivot(0.0)  # no limit: PETSc's 2e-14 rejects rows of nearly empty cells
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
@@ -81,17 +81,17 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 
 
 def renew(A: PETSc.Mat) -> None:
-    """Rebuild the pattern of a matrix in PETSc after sums with other matrices.
+    """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices.
 
-    PETSc orders unknowns by equal row patterns before the sums: LU factors with this ordering are wrong.
+    PETSc orders unknowns by equal row patterns before the sums. LU factors with this ordering are wrong.
     """
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 
 
 def solved(ksp: PETSc.KSP, name: str) -> int:
-    """Return the iterations of a solver's last solve; NotConverged if it failed.
+    """Return the number of iterations of a solver's last solve; raise NotConverged if it failed.
 
-    The line search handles results after the maximum of iterations, or with an indefinite tangent.
+    Results after the largest number of iterations, or with an indefinite tangent, are left to the line search.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -100,13 +100,13 @@ def solved(ksp: PETSc.KSP, name: str) -> int:
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:
-    """Return the number of negative eigenvalues of a matrix from the L D L^T factors of its direct solver."""
+    """Return the number of negative eigenvalues of a matrix, from the L D L^T factors of its direct solver."""
     factors = solver.pc.getFactorMatrix()
     return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 
 
 def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, symmetric: bool) -> PETSc.KSP:
-    """Return a direct solver for many solves with one matrix A of displacements; how: see `plan`."""
+    """Return a direct solver for many solves with the same matrix A of displacements; how: see `plan`."""
     if how != NODAL:
         return direct_solver(A, name, symmetric, package="mumps" if how == MUMPS else None)
     ksp = _preonly(A, name)
@@ -116,13 +116,13 @@ def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, s
 
 
 def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
-    """Let a solver use the factors on the process `rank`."""
+    """Make a solver use factors on the process `rank`."""
     ksp.pc.setType(PETSc.PC.Type.PYTHON)
     ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise matrices at the same time if different processes hold the factors; else each solve does so itself."""
+    """Factorise matrices at the same time if different processes hold their factors; else the solves factorise."""
     for pc in preconditioners:
         pc.setUp()
     for pc in preconditioners:
@@ -131,19 +131,19 @@ def factorise(*preconditioners: PETSc.PC) -> None:
 
 
 class Gathered:
-    """Preconditioner for PETSc: factors of a matrix on one of the processes.
+    """Preconditioner for PETSc: factors of a matrix on one process.
 
     Parameters
     ----------
     x
-        A vector of the matrix's column space.
+        A vector that the matrix can be multiplied with.
     factors
         Factors of the whole matrix.
     rank
-        Process that holds them.
+        Process that holds the factors.
 
-    `setUp` gathers a matrix. Its factors are made on demand, or by `factorise`: after all matrices have been gathered,
-    each process makes its own factors.
+    `setUp` gathers a matrix. The factors are computed on demand, or by `factorise`: after all matrices have been
+    gathered, each process then computes its own factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -156,7 +156,7 @@ class Gathered:
             self._scatter = PETSc.Scatter().create(x, self._rows, self._whole, self._rows)
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """Gather the present matrix."""
+        """Gather the present matrix on the process of the factors."""
         A = pc.getOperators()[1]
         if self._scatter is None:
             self._factors.take(*A.getValuesCSR())
@@ -167,12 +167,12 @@ class Gathered:
         whole.destroy()
 
     def factorise(self) -> None:
-        """Factorise the matrix, if it has changed."""
+        """Factorise the matrix if it has changed."""
         if self._here:
             self._factors.factorise()
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve with the factors."""
+        """Set y to the solution for the right-hand side x."""
         if self._scatter is None:
             y.array_w[:] = self._factors.solve(x.array_r)
             return
@@ -184,7 +184,7 @@ class Gathered:
 
 
 class SingleFactors:
-    """Factors of matrices on one process, made on demand.
+    """Factors of matrices on one process, computed on demand.
 
     Parameters
     ----------
@@ -197,22 +197,22 @@ class SingleFactors:
         self._solver: Latest[tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]] = Latest()
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Take the matrix with these entries."""
+        """Set the matrix, in compressed rows."""
         A = self._solver((rows, columns), lambda: self._of(rows, columns))[0].getOperators()[0]
         A.setValuesCSR(rows, columns, values)
         A.assemble()
 
     def factorise(self) -> None:
-        """Factorise the matrix, if it has changed."""
+        """Factorise the matrix if it has changed."""
         self._solver.value[0].setUp()
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
-        """Return a solver for matrices of this pattern, a solution and a right-hand side."""
+        """Return a solver for matrices with this sparsity pattern, a solution and a right-hand side."""
         A = PETSc.Mat().createAIJ(len(rows) - 1, csr=(rows, columns, np.zeros(len(columns))), comm=PETSc.COMM_SELF)
         return direct_solver(A, self._name, self._symmetric, gathered=True), *A.createVecs()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the solution."""
+        """Return the solution for the right-hand side b."""
         ksp, x, right = self._solver.value
         right.array_w[:] = b
         ksp.solve(right, x)
@@ -220,14 +220,14 @@ class SingleFactors:
 
 
 class NodalFactors:
-    """Block factors of displacement matrices, held by the first process and made on demand.
+    """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
     Parameters
     ----------
     unknowns
-        Displacements; components of a node are consecutive.
+        Unknown displacements; components of a node are consecutive.
     symmetric
-        Whether factors are U^T D U; else L U.
+        Whether the factors are U^T D U; else L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):
@@ -236,30 +236,30 @@ class NodalFactors:
         counts = np.concatenate([[0], np.cumsum(comm.allgather(len(np.unique(node))))])
         block = counts[comm.rank] + np.unique(node, return_inverse=True)[1]
         rows = (block, axis, unknowns.positions)
-        self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # all on the first
+        self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # all on process 0
         self._dim, self._symmetric = unknowns.dim, symmetric
         self._factors: Latest[BlockFactors] = Latest()
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Take the matrix with these entries."""
-        if len(rows) > 1:  # else walls fix all nodes: PETSc cannot factorise an empty matrix
+        """Set the matrix, in compressed rows."""
+        if len(rows) > 1:  # else walls fix all nodes, and PETSc cannot factorise an empty matrix
             make = (rows, columns, *self._nodes, self._dim, self._symmetric)
             self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
 
     def factorise(self) -> None:
-        """Factorise the matrix, if it has changed."""
+        """Factorise the matrix if it has changed."""
         if self._factors.value is not None:
             self._factors.value.factorise()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the solution for all unknowns."""
+        """Return the solution for the right-hand side b, for all unknowns."""
         return self._factors.value.solve(b) if len(b) else b
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the nested-dissection order (n,) of nodes of a grid at x (n, d), m.
+    """Return the nested-dissection order (n,) of nodes of a grid at positions x (n, d), m.
 
-    The grid line through the middle of a box of nodes halves it. Its nodes come last. Halves and lines follow likewise.
+    The middle grid line halves a box of nodes. Nodes on this line come last. Each half is divided in the same way.
     """
     at = np.stack([_lines(along) for along in x.T], axis=1)
     high, every = np.tile(at.max(axis=0, initial=0), (len(at), 1)), np.arange(len(at))
@@ -267,34 +267,34 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
     while (high > low).any():
         axis = (high - low).argmax(axis=1)
         one = every, axis
-        middle, here = (low[one] + high[one]) // 2, at[one]
-        key = 3 * key + np.where(here == middle, 2, here > middle)
-        low[one] = np.where(here < middle, low[one], middle + (here > middle))
-        high[one] = np.where(here > middle, high[one], middle - (here < middle))
+        middle, place = (low[one] + high[one]) // 2, at[one]
+        key = 3 * key + np.where(place == middle, 2, place > middle)
+        low[one] = np.where(place < middle, low[one], middle + (place > middle))
+        high[one] = np.where(place > middle, high[one], middle - (place < middle))
     return np.argsort(key, kind="stable")
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the number (n,) of the grid line of each coordinate (n,), counting occupied lines only."""
+    """Return the index (n,) of the grid line of each coordinate (n,); only lines with nodes are counted."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
 
 class BlockFactors:
-    """Factors of matrices of one pattern, with a block for each node.
+    """Factors of matrices with one sparsity pattern, with a block for each node.
 
     Parameters
     ----------
     rows, columns
-        The pattern.
+        The pattern, in compressed rows.
     block, axis
         Node and component of each unknown.
     x : (n, d)
         Position of each unknown, m.
     dim
-        Components of a node.
+        Number of components of a node.
     symmetric
-        Whether factors are U^T D U; else L U.
+        Whether the factors are U^T D U; else L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):
@@ -308,7 +308,7 @@ class BlockFactors:
             kept = np.flatnonzero(np.repeat(node, lengths) <= node[columns])
         place = self._place.astype(np.int32)
         i, j = np.repeat(place, lengths)[kept], place[columns[kept]]
-        # 1 on the diagonal for fixed components of a node
+        # 1 on the diagonal for components that walls fix
         missing = np.setdiff1d(np.arange(count * dim, dtype=np.int32), place)
         number = np.concatenate([kept, np.full(len(missing), len(columns))]) + 1
         where, n = (np.concatenate([i, missing]), np.concatenate([j, missing])), count * dim
@@ -322,7 +322,7 @@ class BlockFactors:
         ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         ksp.pc.setFactorOrdering("natural")
         ksp.pc.setFactorPivot(0.0)  # see `direct_solver`
-        # room for the factors of nested dissection, 31/4 n^2 log2 n of n^2 nodes (George 1973)
+        # size of the factors in nested dissection, 31/4 n^2 log2 n for n^2 nodes (George 1973)
         fill = 31 / 8 * count * np.log2(count + 1) / max(1, len(self._pattern[1]))
         set_defaults(ksp, {"pc_factor_fill": max(1.0, fill)})
         ksp.setOperators(self._matrix)
@@ -331,16 +331,16 @@ class BlockFactors:
         self._b.set(0.0)
 
     def take(self, values: NDArray[np.float64]) -> None:
-        """Take the matrix with these entries."""
+        """Set the matrix to the given entries of the pattern."""
         self._matrix.setValuesBlockedIJV(*self._pattern, np.concatenate([[0.0], values, [1.0]])[self._source])
         self._matrix.assemble()
 
     def factorise(self) -> None:
-        """Factorise the matrix, if it has changed."""
+        """Factorise the matrix if it has changed."""
         self._solver.setUp()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the solution for all unknowns."""
+        """Return the solution for the right-hand side b, for all unknowns."""
         self._b.array_w[self._place] = b
         self._solver.solve(self._b, self._x)
         return self._x.array_r[self._place]

@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Line search: the length of a Newton step, see `Newton._line_search`.
+"""Line search: length of a Newton step, see `Newton._line_search`.
 
 Without yield the step is full, even if the residual grows: rotations of a bending body cause a spurious stretch at
-first order. It is halved while a law cannot be evaluated at its end, or the residual explodes.
+first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
-In yielding soil the step is full if the residual falls, or if the forces at its end do less than half of the initial
-work along it. Otherwise the search ends where they do about none (Matthies and Strang 1979). Points that the step
-unloads leave their yield surface there, and the next tangent is as stiff as they are. The work includes the fluid's
-work: the work of the forces alone nearly vanishes where these are in equilibrium and the fluid is not. Shorter steps
-with smaller residuals would lead to more short steps. Bracketed secants find the point. Soil that has lost its strength
-needs several: with one, a slumping bank takes twice the Newton steps.
+In yielding soil the step is full if the residual falls, or if the residual forces at its end do less than half of the
+initial work along it. Otherwise the search ends where their work is about zero (Matthies and Strang 1979). There the
+unloading soil is elastic, and so it is in the next tangent. The work includes that of the fluid's residual, because
+the forces' work alone nearly vanishes if only the fluid is out of balance. Shorter steps with smaller residuals would
+lead to more short steps. Bracketed secants find the point. Soil that has lost its strength needs several secants: with
+one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
 overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
-residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid does not count: it grows with the
-step length, and says nothing about the soil. Soil that has not yielded is regularised too: it flows as far when it
-first yields. There is no regularisation before the first yield while the tangents converge: it would cost wet elastic
-soil 1.6 times the Newton steps.
+relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows with
+the step length for any soil. Soil that has not yielded is regularised too: when it first yields, it flows as far.
+Before the first yield there is no regularisation while the tangents converge: it would cost wet elastic soil 1.6 times
+the Newton steps.
 
-A few flowing points may have a tangent with negative stiffness. Newton's direction then leads backwards: it unloads
-them, the next step loads them again, and the iterations cycle. The residuals do negative work along it, and the step is
-reversed.
+A few flowing points may give the tangent a negative stiffness. Newton's direction then leads backwards: it unloads
+these points, the next step loads them again, and the iterations cycle. The work of the residuals along the direction is
+then negative, and the step is reversed.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ from dataclasses import dataclass
 import numpy as np
 
 EXPLODES, SHORTEST = 1e4, 1e-3
-"""Growth of the residual at which a step is halved without yield, and smallest fraction of the step.
+"""Growth of the residual above which a step without yield is halved, and smallest fraction of the full step.
 
-With 1e3 and 1e5 scenes take the same steps: the growth is below them, or the residual not finite.
+With 1e3 and 1e5 scenes take the same steps: the growth is below both, or the residual is not finite.
 """
 WORK = 0.5
-"""Largest work at the end of a step, divided by the work at its start (Matthies and Strang 1979)."""
+"""Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
 FIRM = 0.1
-"""Fraction of elastic shear stiffness in the tangent of yielding soil, per unit of relative residual, at most 1.
+"""Fraction of elastic shear stiffness in the tangent of yielding soil / relative residual; the fraction is at most 1.
 
-With 0.05 and 0.2 a footing on 9 cells takes 291 and 293 Newton steps, pushed ground 42 and 43, with 0.1 293 and 41.
+With 0.05, 0.1 and 0.2 a footing on 9 cells takes 291, 293 and 293 Newton steps, pushed ground 42, 41 and 43.
 """
 
 
 @dataclass(frozen=True)
 class Halving:
-    """Search without yield; step: the next trial, as a fraction of the full step."""
+    """Search without yield; step: next trial, as a fraction of the full step."""
 
     step: float = 1.0
     limit = EXPLODES
-    """Largest growth of the residual at the end."""
+    """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Halving | None:
-        """Return the next trial after one that multiplies the residual by `growth`; None: the search has ended."""
+        """Return the next trial after one in which the residual grew by the factor `growth`; None: the search ends."""
         ends = growth <= self.limit or self.step < 2 * SHORTEST
         return None if ends else Halving(0.5 * self.step)
 
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step with less than half of the initial work of the residuals at its end.
+    """Search for a step at whose end the residuals do less than half of their initial work.
 
-    step: the next trial; low, high: steps between which the work changes its sign; at_low, at_high: work there /
-    initial work; ends: whether the next step is the last one.
+    step: next trial, as a fraction of the full step; low, high: steps between which the work changes its sign.
+    at_low, at_high: work there / initial work; ends: whether the next step is the last trial.
     """
 
     step: float = 1.0
@@ -73,13 +73,13 @@ class Search:
     at_high: float = np.nan
     ends: bool = False
     limit = sys.float_info.max
-    """Largest growth of the residual at the end."""
+    """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Search | None:
-        """Return the next trial after one with this relative work, nan if it is not finite; None: the search has ended.
+        """Return the next trial; work: that of the last trial / initial work, nan if not finite; None: the search ends.
 
-        growth: growth of the residual. A full step that does not increase the residual may end with up to the initial
-        work. A secant gives the next trial; bisection gives it where a bound stays for a second time.
+        growth: factor by which the residual grew. A full step that does not increase the residual may end with up to
+        the initial work. The next trial is that of a secant, or of bisection if a bound stays for a second time.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

@@ -1,27 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""Both linearised problems at once, where a direct solver is too expensive: large bodies in 3D, larger ones in 2D.
+"""Solver for both balances together, where a direct solver is too expensive: large bodies in 3D, larger ones in 2D.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
 
-The solver is GMRES, preconditioned from the right with the upper block triangle. There the fixed-stress operator P = C
-+ beta V approximates the Schur complement C + B K^-1 B^T. One multigrid cycle each approximates K^-1 and P^-1.
+The solver is GMRES, preconditioned from the right with the upper block triangle. In this the fixed-stress operator P =
+C + beta V approximates the Schur complement C + B K^-1 B^T. One multigrid cycle each approximates K^-1 and P^-1.
 
-In 3D it takes 7 to 12 iterations to 1e-3, each with one cycle on K. Other methods were slower, with algebraic multigrid
-and Jacobi smoothing (10 to 15 iterations here). Conjugate gradients on the Schur complement took 3 iterations, but 35
-to 60 cycles in their inner solves. Flexible GMRES with inner solves to 0.1 or 0.01 took 12 to 24 cycles. MINRES with
-the diagonal blocks took 17 to 23, and left five times the residual. In 2D it takes 8 to 1e-5, 12 with AMG on P.
+In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K. Other methods were slower; they were tested with
+algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15. Conjugate gradients on the Schur complement took 3
+iterations, but 35 to 60 cycles in their inner solves. Flexible GMRES with inner solves to 0.1 or 0.01 took 12 to 24
+cycles. MINRES with the diagonal blocks took 17 to 23 cycles, and left five times the residual. In 2D GMRES takes 8
+iterations to 1e-5, 12 with AMG on P.
 
-At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells. A solve that takes many (see `plan`), or is
-predicted to, continues with factors of K in place of the cycle. They stay until a solve with them takes as many: for
-the other tangents of the step about 10 iterations. A step takes 6.2 s, and 8.5 s with factors of each tangent (then 4
-to 6 iterations). Four steps of yielding soil, 12^3 cells, take 33 and 41 s. MUMPS factorises 3190 unknowns in 0.2 s,
-8610 in 1.4 s (PETSc in 3.4 s). No solve takes more than 19 then, nor more than 22 at nu = 0.49 with contrasts of 1e3.
+At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells. If a solve takes too many iterations (see
+`plan`), or is predicted to, factors of K replace the cycle, and are kept until a solve with them takes too many.  With
+other tangents of the step a solve takes about 10. A step takes 6.2 s, with new factors for each tangent 8.5 s (4 to 6
+iterations). Four steps of yielding soil, 12^3 cells, take 33 s, with new factors 41 s. MUMPS factorises 3190 unknowns
+in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s). Solves then take at most 19 iterations, at nu = 0.49 with contrasts of 1e3 at
+most 22.
 
-In 2D yielding soil would take 20 to 500 (a footing on 41 cells, with any smoother). Shear bands are one cell wide, and
-coarse grids cannot represent them. With a viscosity of 0.05 it takes 28. Its time is 0.9 times that of a direct solver
-on 41 cells, but 1.7 times on 81. Moving the volumetric stiffness of K to the storage, p -> p + k B u, leaves K as at nu
-= 0.3, but alternating pressures become almost free: 500 iterations.
+In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
+wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28. Its time is 0.9 times that of a
+direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage, p -> p + k B
+u, K is as at nu = 0.3, but alternating pressures have almost no stiffness: 500 iterations.
 """
 
 from __future__ import annotations
@@ -41,13 +43,13 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid / fluid volume that the residual forces would displace in a drained body.
+"""Smallest scale of the fluid residual / fluid volume that the residual forces would displace in a drained body.
 
-Sealed bodies exchange nearly no fluid: with scales that differ by 5e5 rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. With scales that differed by 5e5, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()
-"""Context between solves: PETSc keeps contexts and all of their references."""
+"""Context between solves: PETSc keeps the last context and all its references."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""
@@ -55,7 +57,7 @@ Inverses = tuple[PETSc.PC, PETSc.PC]
 
 @dataclass(frozen=True, eq=False)
 class BlockOperator:
-    """Operator and preconditioner of one solve for PETSc, with scaled rows.
+    """Operator and preconditioner of one solve for PETSc, with scaled equations.
 
     Parameters
     ----------
@@ -64,11 +66,11 @@ class BlockOperator:
     inverses
         Approximations of K^-1 and P^-1.
     work
-        Two displacement vectors and two pressure vectors.
+        Work vectors: two of displacements and two of pressures.
     scale
-        Scales of the rows of both problems.
+        Scales of the equations of both balances.
     slopes
-        Derivative of the fluxes with respect to displacements, if it is included.
+        Derivative of the fluxes with respect to displacements, if the tangent includes it.
     """
 
     momentum: MomentumSystem
@@ -79,7 +81,7 @@ class BlockOperator:
     slopes: tuple[FluxSlope, ...] = ()
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Multiply by the operator."""
+        """Multiply x by the operator."""
         s, (u, f, p, g) = self.storage, self.work
         self.part(x, u, p)
         s.change_by(u, g, *self.slopes)
@@ -90,7 +92,7 @@ class BlockOperator:
         self.join(f, g, y, *(1 / scale for scale in self.scale))
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Apply the preconditioner."""
+        """Apply the preconditioner to x."""
         (u, f, p, g), (on_u, on_p) = self.work, self.inverses
         self.part(x, f, g, *self.scale)
         on_p.apply(g, p)
@@ -99,7 +101,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return (fluid volume displaced by the residual forces) / (their norm) of each part (parts,), m^d/N."""
+        """Return fluid volume displaced by the residual forces / norm of these forces, in each part (parts,), m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -109,30 +111,30 @@ class BlockOperator:
 
     @staticmethod
     def part(x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set (u, p) to the scaled parts of x."""
+        """Set u and p to the displacement and pressure entries of x, scaled."""
         values = x.array_r
         np.multiply(values[: u.local_size], scale_u, out=u.array_w)
         np.multiply(values[u.local_size :], scale_p, out=p.array_w)
 
     @staticmethod
     def join(u: PETSc.Vec, p: PETSc.Vec, x: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set the parts of x to (u, p), scaled."""
+        """Set the entries of x to u and p, scaled."""
         values = x.array_w
         np.multiply(u.array_r, scale_u, out=values[: u.local_size])
         np.multiply(p.array_r, scale_p, out=values[u.local_size :])
 
 
 class BlockSolver:
-    """GMRES on displacement and pressure together.
+    """GMRES for displacements and pressures together.
 
     Parameters
     ----------
     how
-        The plan.
+        Solver plan.
     momentum, storage
         The matrices.
     cycles
-        One multigrid cycle each on K and on P.
+        Preconditioners: one multigrid cycle each on K and on P.
     """
 
     def __init__(self, how: SolverPlan, momentum: MomentumSystem, storage: StorageSystem, cycles: Inverses):
@@ -165,29 +167,29 @@ class BlockSolver:
         slopes: tuple[FluxSlope, ...] = (),
         factors: Inverses | None = None,
     ) -> tuple[int, Inverses | None]:
-        """Solve for (du, dp) with the residuals of both problems on the right side.
+        """Solve for (du, dp) with the residuals of both balances as right-hand side.
 
         Parameters
         ----------
         scales : (parts,), (parts,)
-            Scales of both residuals in each part, N and m^d.
+            Scales of both residuals in each connected part, N and m^d.
         rtol
-            Tolerance relative to the norm of both scaled residuals, in each part.
+            Tolerance relative to the norm of both scaled residuals, for each part.
         slopes
-            Derivative of the fluxes with respect to displacements, if it is included.
+            Derivative of the fluxes with respect to displacements, if the tangent includes it.
         factors
-            Factors in place of the cycles so far.
+            Factors that already replace the cycles, or None.
 
         Returns
         -------
-        The number of iterations, and the factors that now replace the cycles, or None.
+        The number of iterations, and the factors that replace the cycles from now on, or None.
         """
         operator = BlockOperator(self._momentum, self._storage, factors or self._cycles, self._work)
         on_u, on_p = self._momentum.of_parts, self._storage.of_parts
         residuals = self._momentum.residual, self._storage.residual
         scale_u, scale_p = scales
         scale_p = np.maximum(scale_p, LEAST * scale_u * operator.displaced())
-        if on_u.count > 1:  # parts are uncoupled: all count equally
+        if on_u.count > 1:  # parts are uncoupled: their residuals are scaled to equal size
             sizes = [of.norms(r.array_r) for of, r in zip((on_u, on_p), residuals, strict=True)]
             size = np.hypot(sizes[0] / scale_u, sizes[1] / scale_p)
             scale_u, scale_p = (scale * np.where(size > 0, size, 1.0) for scale in (scale_u, scale_p))
@@ -205,7 +207,7 @@ class BlockSolver:
         return count, factors
 
     def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve with these approximations of K^-1 and P^-1; return the iterations, at most `most`."""
+        """Solve with given approximations of K^-1 and P^-1; return the number of iterations, at most `most`."""
         operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
@@ -216,7 +218,7 @@ class BlockSolver:
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return preconditioners with factors of the present K, and in 2D of the present P, which may change later."""
+        """Return factors of the present K, and in 2D of the present P, as preconditioners for later tangents too."""
         K, unknowns = self._momentum.K, self._momentum.unknowns
         solvers = [displacement_solver(K, "factors", unknowns, self._plan.fallback, self._plan.symmetric)]
         if unknowns.dim == 2:
@@ -229,7 +231,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that stops `many` iterations if the rate of the last quarter of them is too slow."""
+    """Return a monitor that ends a solve if the rate of the last many / 4 iterations predicts more than `many`."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

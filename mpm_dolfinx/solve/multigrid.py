@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Geometric multigrid on the background grid: coarse grids of twice the spacing, with interpolated matrices.
 
-A coarse unknown belongs to a node, or a cell, of a grid of half as many cells along each axis. Displacements are
-interpolated bilinearly between nodes, pressures between centres of cells. Coarse matrices are Q^T A Q (Galerkin), so
-cut cells, penalties and laws need no special treatment.
+A coarse unknown belongs to a node, or a cell, of a grid with half as many cells along each axis. Displacements are
+interpolated bilinearly between nodes, pressures between centres of cells. Coarse matrices are Q^T A Q (Galerkin) with
+the interpolation Q, so cut cells, penalties and laws need no special treatment.
 
-With 504000 displacements and 251000 pressures in 2D (10^6 points) the grids of both take 0.33 s, coarse matrices 0.1 s
-for each tangent, a cycle 0.06 s. A step takes 2.6 s in all, with factors (orders, symbolic and numeric ones) 7.6 s. A
-wet cube of 20^3 cells in shear, 16 Newton steps, takes 2.0 s, with smoothed aggregation (GAMG) 11.6 s in as many
-iterations.
+With 504000 displacements and 251000 pressures in 2D (10^6 points) both hierarchies take 0.33 s, coarse matrices 0.1 s
+for each tangent, a cycle 0.06 s. A step takes 2.6 s in all, with factors (including ordering) 7.6 s. A wet cube of 20^3
+cells in shear, 16 Newton steps, takes 2.0 s; with smoothed aggregation (GAMG) it takes 11.6 s in as many iterations.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ OPTIONS = {
     "mg_levels_pc_type": "sor",
 }
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
-"""Smoother for nearly incompressible bodies where a direct solver must not replace multigrid.
+"""Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
 
-Test without a direct solver: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. A solve takes 126
-iterations, by GAMG 112; with a single sweep GMRES fails. With a direct solver both smoothers take the same time.
+Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. Without a direct solver a solve takes 126
+iterations, with GAMG 112; with a single sweep GMRES fails. With a direct solver both smoothers take the same time.
 """
-MAYBE, NOT, IS = 0, 1, 2  # see `_shared`
+MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
 
 
@@ -53,28 +52,29 @@ def multigrid_solver(
     firmly: bool = False,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> PETSc.KSP:
-    """Return GMRES with multigrid, set up again after A has changed.
+    """Return GMRES with multigrid, which is set up again after A has changed.
 
-    GMRES copes with tangents that are unsymmetric or, in buckling bodies, indefinite.
+    GMRES also solves with tangents that are unsymmetric or, in buckling bodies, indefinite.
 
     Parameters
     ----------
     A
-        The matrix, which may still be empty.
+        Matrix, which may still be empty.
     name
-        Prefix of the solver's options.
+        Prefix of the solver's PETSc options.
     places : (n, d + 1)
-        Rows of this process: indices along the axes of the grid, >= 0, and kind, >= 0. Kinds are not mixed.
+        Unknowns of this process: indices along the axes of the grid, >= 0, and component, >= 0. Components are
+        interpolated separately.
     held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies: interpolations vanish there.
+        Fixed degrees of freedom in cells of bodies; interpolated displacements vanish there.
     nodal
         Whether the unknowns belong to nodes.
     coarsest
-        Largest number of unknowns of a grid with a direct solver.
+        Largest number of unknowns of the coarsest grid, which has a direct solver.
     firmly
-        Whether to smooth three times as often: see `FIRMLY`.
+        Whether to use the stronger smoother `FIRMLY`.
     lines : (n,) along each axis, m
-        Grid lines, for cells of many sizes: nodes are then interpolated by distance.
+        Grid lines, for cells of many sizes: displacements are then interpolated by distance.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
@@ -100,7 +100,7 @@ def interpolations(
     coarsest: int,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> list[PETSc.Mat]:
-    """Return the interpolations from each coarse grid to the next finer one, the finest first.
+    """Return the interpolations from each coarse grid to the next finer grid, the finest first.
 
     comm: processes that share the unknowns; other parameters as in `multigrid_solver`.
     """
@@ -121,22 +121,22 @@ def interpolation(
     nodal: bool,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the interpolation to unknowns, this process's coarse unknowns, and fixed coarse degrees of freedom.
+    """Return the interpolation, this process's coarse unknowns, and fixed coarse degrees of freedom.
 
-    A coarse cell is an unknown if it contains one. A coarse node is an unknown if an unknown is interpolated from it.
-    Next to a fixed node it must also coincide with an unknown. The columns are then linearly independent.
+    A coarse cell is kept if a fine cell in it is an unknown. A coarse node is kept if it interpolates to a free fine
+    node; if it also interpolates to a fixed node, it must coincide with a free one. The columns are then independent.
     """
     rows, coarse, weights = _hats(places, nodal, lines)
-    beside = _hats(held, nodal, lines)[1]
-    whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # weight at the same node, or in the coarse cell
-    states = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(beside), NOT)])
-    among = np.concatenate([coarse, beside])
+    near_fixed = _hats(held, nodal, lines)[1]
+    whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # weight of the coinciding node, or of the coarse cell
+    states = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(near_fixed), NOT)])
+    among = np.concatenate([coarse, near_fixed])
     shape = tuple(int(n) for n in over_all(comm, among.max(axis=0, initial=0), MPI.MAX) + 3)  # indices start at -1
     keys, at = np.unique(np.ravel_multi_index((among + 1).T, shape), return_inverse=True)
     stated = np.full(len(keys), MAYBE)
     for word in (NOT, IS):
         stated[at[states == word]] = word
-    number, mine = _shared(comm, keys, int(np.prod(shape)), stated)
+    number, owned = _shared(comm, keys, int(np.prod(shape)), stated)
     column = number[at[: len(coarse)]]
     kept = column != NONE
     rows = rows[kept]
@@ -147,20 +147,20 @@ def interpolation(
     Q = scipy.sparse.coo_matrix((weights, (rows, column)), shape=(len(places), column.max(initial=-1) + 1)).tocsr()
     Q.sort_indices()
     csr = Q.indptr.astype(PETSc.IntType), Q.indices.astype(PETSc.IntType), Q.data
-    sizes = (len(places), None), (np.count_nonzero(mine), None)
+    sizes = (len(places), None), (np.count_nonzero(owned), None)
     found = np.column_stack(np.unravel_index(keys, shape)) - 1
-    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[mine], found[(number == NONE) & nodal]
+    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[owned], found[(number == NONE) & nodal]
 
 
 def _every_other(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lines (m,), m, of the grid of half as many cells; its last cell may extend beyond the grid."""
+    """Return the lines (m,), m, of the grid with half as many cells; its last cell may extend beyond the grid."""
     return x[::2] if len(x) % 2 else np.append(x[::2], 2 * x[-1] - x[-2])
 
 
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return fine indices (m,), coarse places (m, d + 1) and weights (m,) of the interpolation."""
+    """Return indices of fine unknowns (m,), coarse positions (m, d + 1) and weights (m,) of the interpolation."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
@@ -184,29 +184,28 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the numbers (n,) of coarse unknowns, NONE for others, and whether this process owns them (n,).
+    """Return the numbers (n,) of coarse unknowns, NONE for other candidates, and whether this process owns them (n,).
 
-    The lowest-ranked process that asks for an unknown owns it. Keys are distributed over processes to find owners and
-    numbers.
+    The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
     Parameters
     ----------
     keys : (n,)
-        Candidates of this process, ascending, below `count`.
+        Coarse candidates of this process, ascending, below `count`.
     stated : (n,)
-        Status of each by the data of this process, MAYBE, NOT or IS; the largest over all processes counts.
+        Status of each candidate on this process: MAYBE, NOT or IS; the largest value of all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
-    asked, who = np.unique(ask.send(keys), return_inverse=True)
+    distinct, who = np.unique(ask.send(keys), return_inverse=True)
 
     def of_all(values: NDArray[np.int64], op: np.ufunc) -> NDArray[np.int64]:
-        found = np.full(len(asked), NONE if op is np.minimum else 0)
+        found = np.full(len(distinct), NONE if op is np.minimum else 0)
         op.at(found, who, ask.send(values))
         return ask.back(found[who])
 
     rank = np.where(of_all(stated, np.maximum) == NOT, NONE, comm.rank)
-    mine, number = (rank != NONE) & (of_all(rank, np.minimum) == comm.rank), np.full(len(keys), NONE)
-    own = np.count_nonzero(mine)
+    owned, number = (rank != NONE) & (of_all(rank, np.minimum) == comm.rank), np.full(len(keys), NONE)
+    own = np.count_nonzero(owned)
     start = comm.exscan(own) if comm.size > 1 else 0
-    number[mine] = (start or 0) + np.arange(own)
-    return of_all(number, np.minimum), mine
+    number[owned] = (start or 0) + np.arange(own)
+    return of_all(number, np.minimum), owned

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The equations of a substep: momentum and storage, coupled by u and p.
+"""Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
 Unconnected parts of the bodies balance independently: each has its own forces and fluid, and its own step lengths.
-Neither the state nor the stiffness of other parts affects it.
+The state and the stiffness of other parts do not affect it.
 
 A Newton step of the two problems reads
 
@@ -10,11 +10,11 @@ A Newton step of the two problems reads
     [ B   C   ] [dp] = - [R_p].
 
 `schur-cg` eliminates du, and solves with S = C + B K^-1 B^T by conjugate gradients. The preconditioner is the
-fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: less beta V for pressures that alternate
-from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly
-unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: in turn, a storage solve
-with C + beta V at frozen stress, and a momentum solve. Where a direct solver is too expensive, in large bodies,
-multigrid is used. `schur-...` then solve both problems at once, see `monolithic`.
+fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: beta V is smaller for pressures that
+alternate from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full,
+slightly unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve
+with C + beta V at constant stress, and a momentum solve, alternate. Large bodies use multigrid, because a direct solver
+is too expensive. `schur-...` then solve for both unknowns together, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -40,34 +40,35 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance over the storage error: unconverged rotations cause spurious volume changes
+INNER = 1e-3  # momentum tolerance / storage error: unconverged rotations cause spurious volume changes
 MOMENTUM_STEPS = 10
-REBALANCED = 6  # total iterations with changing contacts, in units of the most iterations
+REBALANCED = 6  # largest number of iterations with changing contacts / largest number without
 LOOSEST = 1e-2
-"""Largest residual after a linear solve, relative to that before it.
+"""Largest residual after a linear solve / residual before the solve.
 
-Plateau (soil): halved 2.2e-11, doubled 6.0e-12, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 2.2e-11, twice by 6.0e-12, finer cells by 3.0e-02.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve, relative to the tolerance.
+"""Residual after the last linear solve / tolerance.
 
-Plateau (soil): halved 4.0e-12, doubled 3.1e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-12, twice by 3.1e-11, finer cells by 3.0e-02.
 """
-SETTLED = 1e-2  # residual below which slipping contacts may stick: above it the contact area still changes
+SETTLED = 1e-2  # residual below which slip of contacts may end: above it the contact area still changes
 ERROR = 1 / 20
-"""Assumed pressure error of a run, relative to the first-order estimate e.
+"""Assumed pressure error of a run / first-order estimate e.
 
-For a mode with decay rate l, sdirk2 has an error of 0.081 dt |l| e in a step, at most 0.28 e, by its stability
-function. A pressure that follows a varying load has an error of at most 0.14 e. With little decay in a step such errors
-add up, to 0.081 e. Measured, against steps an eighth as long: 0.05 to 0.08 e under loads and drained pressures that
-rise or oscillate, 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e late in a consolidation; 0.17 e in a first
-step of a load that grows from zero, 0.26 e after a jump. The largest error of a run is thus 0.7 to 5 times this.
+For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
+e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay in a step such errors add
+up, to 0.081 e. Measured errors, against steps an eighth as long: 0.05 to 0.08 e under loads and drained pressures that
+rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a consolidation; 0.17 e in a first
+step of a load that grows from zero; 0.26 e after a jump. The largest error of a run is thus 0.7 to 5 times e / 20.
 """
 SUDDEN = np.sqrt(2)
 """Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
 
-The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2), where the changes
-are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). Pressures that follow the loads have (1 - gamma) / gamma.
+The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2). The changes there
+are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma if pressures follow loads.
+Source: exact, the ratio of these changes.
 """
 
 
@@ -77,10 +78,10 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Relative residuals of momentum and storage in the parts of the bodies; arrays (parts,).
+    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,).
 
-    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, the exchanged fluid
-    volume, m^d; start: forces at the start of the step, N; fluid: residual of the storage.
+    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, m^d, the exchanged
+    fluid volume; start: forces at the start of the step, N; fluid: residual of the storage, or None.
     """
 
     u: NDArray[np.float64]
@@ -92,12 +93,12 @@ class Errors:
 
     @cached_property
     def each(self) -> NDArray[np.float64]:
-        """The larger of both residuals of each part."""
+        """The larger of the two residuals, for each part."""
         return np.maximum(self.u, self.p)
 
     @cached_property
     def worst(self) -> float:
-        """The largest residual."""
+        """The largest residual of all parts."""
         return float(self.each.max(initial=0.0))
 
 
@@ -110,30 +111,30 @@ def solve_substep(
     report: Report,
     kept: Kept,
 ) -> Rates | None:
-    """Solve the equations of a substep for (u, p) in the forms' functions; return the rates of the storage.
+    """Solve the equations of a substep for (u, p), stored in the forms' functions; return the rates of the storage.
 
     Parameters
     ----------
     solvers
-        Solvers of the active set.
+        Linear solvers for the unknowns of the active cells.
     momentum, storage
-        The problems; storage is None without fluid.
+        The balances; storage is None without fluid.
     as_reset, key
-        See `OnGrid.as_reset`: its tangent is used for linear laws while the key stays the same.
+        See `OnGrid.as_reset`. Linear laws use this tangent while the key stays the same.
     report
-        Report of the step, to which the substep's counts are added.
+        Report of the step, to which this function adds the counts of the substep.
     kept
-        Data shared by the tangents of the step.
+        Data that the tangents of the step share.
 
     Raises
     ------
     NotConverged
-        With the residual history.
+        Newton's method did not converge; the exception has the residual history.
     """
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
     serves = report.newton > 0 and momentum.smooth
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual reveals a failed solve
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual shows a failed solve
         errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
         took = newton.report
         if took.newton and storage is None and solvers.plan.symmetric and not solvers.plan.iterative:
@@ -162,18 +163,18 @@ def note_pressures(
     dt: float,
     rates: Sequence[Rates],
 ) -> None:
-    """Note pressure changes of a step in its report, and the estimated error of the step.
+    """Store the pressure changes of a step and its estimated error in the report.
 
-    The difference between the step and a first-order step is seconds (Q2 - Q1), a fluid volume. The fixed-stress
-    operator turns it into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996). Cells are
-    weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
+    The difference between the step and a first-order step is the fluid volume seconds (Q2 - Q1). The fixed-stress
+    operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
+    Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
     Parameters
     ----------
     seconds
-        Time weight of the first rates, s.
+        Weight of the first rates in the step, s.
     dt
-        The step, s.
+        Length of the step, s.
     """
     if storage is None or not report.newton:
         return
@@ -197,7 +198,7 @@ def note_pressures(
 
 
 class Newton:
-    """Newton's method on the problems of one substep.
+    """Newton's method for the balances in one substep.
 
     Parameters
     ----------
@@ -216,9 +217,9 @@ class Newton:
         self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
-        """Solve both problems by Newton's method; the tangent is kept while it converges, for linear laws over steps.
+        """Solve both balances by Newton's method; the tangent is kept while it converges, for linear laws over steps.
 
-        serves: whether the tangent of the previous substep may be used.
+        serves: whether the tangent of the previous substep may be reused.
         """
         errors, other = self._begin()
         fresh = self._linear or not serves
@@ -231,16 +232,16 @@ class Newton:
         return self._iterations(errors, as_reset, key, fresh)
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p) with these errors; fresh: with a new tangent."""
+        """Iterate from the present (u, p) with the given errors; fresh: whether to start with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep
         count = 0
         slow = False
-        went: NDArray[np.float64] | float = 0.0
+        log_change: NDArray[np.float64] | float = 0.0
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
-            if found is not errors:  # converged, but contacts or multipliers have changed
+            if found is not errors:  # converged, but contact forces or multipliers have changed
                 errors = found
                 count = 0
                 fresh |= any(one.touches for one in self._momentum.loads)
@@ -252,10 +253,10 @@ class Newton:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
             if self._storage is not None:
-                went = self._solvers.restrain(self._storage, went)
+                log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
-            # infinite before any fluid has moved
+            # infinite before any fluid has been exchanged
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle()
@@ -264,21 +265,29 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Return the errors after updates of contact pressures and slip, repeated while the balance holds."""
+        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance.
+
+        Raise NotConverged after as many updates as Newton's method may take iterations.
+        """
         momentum = self._momentum
+        count = 0
         while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
-            errors = self._errors(errors.start)
+            self._check(count, "newton")
+            errors, count = self._errors(errors.start), count + 1
         return errors
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors at the starting point: a guess with a smaller residual than the present (u, p), if any.
+        """Return the errors at the starting point: a guess that is better than the present (u, p), if any.
 
-        Also return the alternative starting point, if there is one.
+        A better guess has less potential energy in elastic bodies, else a smaller residual. Bending has small forces:
+        a good guess of it may have a larger residual than no guess. Also return the other starting point, or
+        None.
         """
         errors, start = self._errors(), self._iterate()
-        guesses = [] if self._linear else self._momentum.guesses()
+        guesses = [] if self._linear or errors.worst <= self._scheme.tolerance else self._momentum.guesses()
+        measure = self._potential() if self._momentum.smooth else lambda errors: errors.u
         at = last = start[0]
-        least = errors.u
+        least = measure(errors)
         for guess in guesses:
             self._go_to([guess, *start[1:]])
             last = None
@@ -286,35 +295,45 @@ class Newton:
                 found = self._errors(errors.start)
             except NotConverged:
                 continue
-            better = found.u < least  # p is the same, and before any fluid has moved its residual is meaningless
+            value = measure(found)
+            better = value < least  # p is the same; its residual is meaningless before any fluid has been exchanged
             if better.any():
                 at = guess if better.all() else np.where(better[self._parts], guess, at)
-                least, last = np.minimum(found.u, least), at if better.all() else None
+                least, last = np.minimum(value, least), at if better.all() else None
         if last is not at:
             self._go_to([at, *start[1:]])
             found = self._errors(errors.start)
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
+    def _potential(self) -> Callable[[Errors], NDArray[np.float64]]:
+        """Return a function for twice the present potential energy (parts,), J, less that at the present u.
+
+        It is the work of the residuals on the way, by the trapezoidal rule. The errors must be those of the present u.
+        """
+        system = self._momentum.system
+        r, u = system.residual.array_r.copy(), system.step.array_r.copy()
+        return lambda _: system.of_parts.sums((system.residual.array_r + r) * (system.step.array_r - u))
+
     def _iterate(self) -> list[NDArray[np.float64]]:
-        """Return a copy of the present (u, p) where these are active, m and Pa."""
+        """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
         return [f.x.array[rows] for f, rows in self._functions]
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
-        """Parts of the active degrees of freedom."""
+        """Connected part of each active degree of freedom."""
         momentum = self._momentum
         return momentum.system.parts.nodes[momentum.forms.active.now.dofs // momentum.forms.grid.dim]
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
-        """Set (u, p)."""
+        """Set (u, p) to an iterate."""
         for (f, rows), values in zip(self._functions, iterate, strict=True):
             f.x.array[rows] = values
 
     def check_stable(self) -> None:
-        """Refuse an unstable equilibrium: smaller steps find the path that leaves it.
+        """Raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
 
-        Its tangent has negative eigenvalues. The check is for dry bodies only, because water delays buckling. If a step
-        has kept its first tangent, the next step makes the check.
+        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
+        delays buckling. If a step has kept its first tangent, the check follows in the next step.
         """
         if not negative_pivots(self._solvers.solve_u):
             return
@@ -324,7 +343,7 @@ class Newton:
             raise NotConverged(why, self.report.history)
 
     def alternate(self) -> Errors:
-        """Fixed-stress iteration: momentum at fixed pressure, then storage at fixed stress, until both converge."""
+        """Alternate, until both converge, solves of momentum at fixed pressure and of storage at fixed stress."""
         errors, report = self._errors(), self.report
         self._linearise()
         while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
@@ -345,7 +364,7 @@ class Newton:
         return errors
 
     def _balance_momentum(self, errors: Errors) -> None:
-        """Solve the momentum by Newton's method at fixed pressure."""
+        """Solve the balance of momentum at fixed pressure, by Newton's method."""
         goal = INNER * max(self._scheme.tolerance, min(1.0, errors.p.max()))
         for count in range(MOMENTUM_STEPS):
             if count and errors.u.max() <= goal:
@@ -363,12 +382,12 @@ class Newton:
             raise NotConverged(f"no convergence in {count} iterations", self.report.history)
 
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
-        """Assemble both residuals; return and note their norms relative to their scales.
+        """Assemble both residuals; store and return their norms relative to their scales.
 
-        start (parts,): forces at the start of the step, N. Forces of other iterates do not enter the scale: after a
+        start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Round-off counts as 0. The noted residual includes it, with a scale of at least round-off over tolerance.
+        Round-off counts as 0. The stored residual includes it, with a scale of at least round-off / tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -384,35 +403,35 @@ class Newton:
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
-            where, what = ("storage: a source", size) if np.isfinite(r.norm()) else ("momentum: a law or term", norm)
-            raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
+            where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
+            raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
         self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
-        """Set the tangent at the present (u, p), which is not kept for other steps; firmness: see `LinearSolvers`."""
+        """Set the tangent at the present (u, p), not kept for other steps; firmness: see `LinearSolvers`."""
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
     def _linearise_as_reset(self, as_reset: AsReset) -> bool:
-        """Set the tangent at the state of the last reset of the grid, however many steps ago."""
+        """Set the tangent at the state of the last reset of the grid, in this step or an earlier one."""
         with as_reset() as pieces:
             if self._storage is not None:
                 self._storage.set_fluxes()
             return self._solvers.linearise(self._momentum, self._storage, self._kept, pieces)
 
     def _direction(self, errors: Errors, slow: bool) -> int:
-        """Solve the linearised problem; return the coupling iterations.
+        """Solve the linearised problem; return the number of coupling iterations.
 
-        slow: whether the last step converged slowly with its own tangent, without the derivative of fluxes with respect
-        to displacements.
+        slow: whether the last step converged slowly with a new tangent.  The tangent then also contains the derivative
+        of fluxes with respect to displacements.
         """
-        # no more accurate than the next residual needs
+        # the next residual needs no more accuracy
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
         if self._momentum.linear and not (iterative and self._momentum.forms.grid.dim == 3):
             least = 0.0
         rtol = min(LOOSEST, max(least, SOLVED * self._scheme.tolerance / min(1.0, errors.worst)))
-        if iterative:  # the penalty of prescribed displacements dominates the first residual and hides the rest
+        if iterative:  # the penalty of prescribed displacements dominates the first residual and hides other terms
             rtol = max(SOLVED * self._scheme.tolerance, rtol / max(1.0, errors.worst))
         if self._storage is not None:
             rtol = min(rtol, self._storage.accuracy)
@@ -436,15 +455,15 @@ class Newton:
             return count
 
     def _line_search(self, before: Errors, elastic: bool) -> Errors:
-        """Move against the direction, each part by the step length of `search`; return the errors there."""
+        """Move u and p against the direction; the line search sets the step length of each part; return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        first = np.full(of.count, np.nan) if elastic else self._work()  # without yield it is not asked for
+        first = np.full(of.count, np.nan) if elastic else self._work()  # without yield it is not used
         if (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
-        begun = Halving() if elastic else Search()
-        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], begun)
+        start = Halving() if elastic else Search()
+        searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], start)
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
@@ -463,7 +482,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors) -> tuple[Errors, NotConverged | None]:
-        """Return the errors after a trial step, infinite where a law cannot be evaluated, and the exception, if any."""
+        """Return the errors after a trial step, infinite where a law cannot be evaluated, and its exception or None."""
         try:
             return self._errors(before.start), None
         except NotConverged as failed:
@@ -474,7 +493,7 @@ class Newton:
     def _work(self) -> NDArray[np.float64]:
         """Return the work (parts,), J, of both residuals along the direction.
 
-        The coupling terms cancel in the sum, so the work depends on the tangent blocks alone: see `search`.
+        The coupling terms cancel in the sum. The work thus depends only on the diagonal blocks of the tangent.
         """
         system = self._momentum.system
         work = system.of_parts.sums(system.residual.array_r * self._solvers.du.array_r)
@@ -484,7 +503,7 @@ class Newton:
         return work + system.of_parts.sums(system.residual.array_r * self._solvers.dp.array_r)
 
     def _move(self, steps: NDArray[np.float64]) -> None:
-        """Move the parts by fractions (parts,) of the direction."""
+        """Move the parts by the given fractions (parts,) of the direction."""
         system = self._momentum.system
         system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
         if self._storage is not None:

@@ -21,25 +21,24 @@ class Numerics:
     Parameters
     ----------
     quadrature
-        "domain": exact integration over cut particle domains; "point": at the points, as in standard MPM; boxes only,
-        no axisymmetry.
+        "domain": exact integration over cut particle domains. "point": at the material points, as in standard MPM; only
+        for boxes, not in axisymmetry.
     coupling
-        Coupling scheme of momentum and storage, one of `COUPLINGS`.
+        Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance
-        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume; in (0, 1).
+        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume, in (0, 1).
     method
-        Time integration: "sdirk2", of second order, or "backward-euler".
+        Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
-        Whether to renew particle domains of yielded soil that have become longer than a cell, see
-        `stepping/renewal.py`. It needs dry or saturated soil in plane strain, no inertia, no groups, and
-        `quadrature="domain"`.
+        Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
+        requires dry or saturated soil in plane strain, no inertia, no `Contact`, and `quadrature="domain"`.
     petsc_options
-        PETSc's options for the solvers, see `Scheme`.
+        PETSc options for the solvers, see `Scheme`.
 
     Raises
     ------
     ValueError
-        An invalid option; the message names it and the allowed values.
+        An option is invalid; the message names the option and its allowed values.
     """
 
     quadrature: str = "domain"

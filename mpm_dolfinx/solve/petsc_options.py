@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""PETSc's options for the solvers: defaults of the package, and options of the user, which replace them.
+"""PETSc options for the solvers: defaults of the package, which options of the user replace.
 
-Names begin with the prefix of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line with "mpm_" before it.
+A name begins with the prefix of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line "mpm_" precedes it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ PREFIXES = {
     "factors_": "factors of K that replace multigrid cycles",
     "storage_factors_": "factors of the fixed-stress operator that replace multigrid cycles",
 }
-"""Prefixes of options, and their solvers."""
+"""Prefixes of option names, and their solvers."""
 
 
 def check(options: Mapping[str, Any]) -> None:
-    """Raise a ValueError for a name without the prefix of a solver."""
+    """Raise ValueError for an option name without the prefix of a solver."""
     for name in options:
         if not isinstance(name, str) or not name.startswith(tuple(PREFIXES)):
             raise ValueError(f"petsc_options {name!r}: must begin with one of {', '.join(PREFIXES)}")
@@ -36,7 +36,7 @@ def check(options: Mapping[str, Any]) -> None:
 
 @contextmanager
 def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterator[None]:
-    """Set the user's PETSc options while solvers are created; remove the options that they read from `unread`."""
+    """Set the user's PETSc options while solvers are created; remove from `unread` the options that solvers read."""
     given, before = PETSc.Options(), {}
     for name, value in options.items():
         full = f"mpm_{name}"
@@ -53,7 +53,7 @@ def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterato
 
 
 def set_defaults(solver: PETSc.KSP, values: Mapping[str, Any]) -> None:
-    """Set options of a solver that the user has not set."""
+    """Set options of a solver, except options that the user has set."""
     options = PETSc.Options(solver.getOptionsPrefix())
     for name, value in values.items():
         if not options.hasName(name):
@@ -61,7 +61,7 @@ def set_defaults(solver: PETSc.KSP, values: Mapping[str, Any]) -> None:
 
 
 def _read(name: str) -> bool:
-    """Return whether PETSc has read an option; petsc4py has no function for it."""
+    """Return whether PETSc has read an option; petsc4py lacks this function."""
     found = ctypes.c_int()
     ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(found))
     return bool(found.value)

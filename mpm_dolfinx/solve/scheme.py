@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Coupling schemes of momentum and storage."""
+"""Coupling schemes of the balances of momentum and fluid."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes, with beta as a multiple of alpha^2/K_dr; None: 1/K_w."""
+"""Coupling schemes, and the factor f of beta = f alpha^2 / K_dr in their fixed-stress operator; None: beta = 1/K_w."""
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """A coupling scheme and its accuracy.
+    """A coupling scheme with its tolerance and limits.
 
     Parameters
     ----------
     coupling
         Name in `COUPLINGS`.
     tolerance
-        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume; in (0, 1).
+        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume, in (0, 1).
     most_newton, most_coupling
         Largest number of Newton steps, or coupling iterations of `fixed-stress`, in a step.
     petsc_options
-        PETSc's options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
+        PETSc options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
         `petsc_options.PREFIXES`. A warning lists options that no solver of the scene reads.
 
     Raises
     ------
     ValueError
-        A value out of its range; the message names it.
+        A value is out of its range; the message names it.
     """
 
     coupling: str
@@ -56,7 +56,7 @@ class Scheme:
 
     @property
     def richardson(self) -> bool:
-        """Whether the two problems are solved in turn."""
+        """Whether solves of the two balances alternate."""
         return self.coupling.startswith("fixed-stress")
 
     @property
@@ -66,5 +66,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Multiple of beta."""
+        """Factor of beta, see `COUPLINGS`; 1 for beta = 1/K_w."""
         return COUPLINGS[self.coupling] or 1.0

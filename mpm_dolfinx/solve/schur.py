@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Solvers of the linearised problem, made once for the matrices of an active set.
+"""Solvers of the linearised problem, created once for the matrices of a set of active cells.
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
 
 Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S, preconditioned with the
-fixed-stress operator. For large bodies both unknowns are solved for at once, see `monolithic`.
+fixed-stress operator. For large bodies GMRES solves for both unknowns together, see `monolithic`.
 
-PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, gives the same
-digits, and takes 0.8 to 1 of the time of a solve. It needs a copy of -B^T at each tangent, and fixed-stress iterations
-would still need the blocks.
+PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, with the same
+digits. A solve takes 0.8 to 1 times as long. But this needs a copy of -B^T for each tangent, and fixed-stress
+iterations would still need the blocks.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan of problems with these matrices; symmetric: whether K is symmetric."""
+    """Return the solver plan for problems with these matrices; symmetric: whether K is symmetric."""
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
@@ -56,18 +56,18 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 
 @dataclass(frozen=True, eq=False)
 class SchurComplement:
-    """Matrix-free S = C + B K^-1 B^T for PETSc's Krylov solvers.
+    """Matrix-free Schur complement S = C + B K^-1 B^T for PETSc's Krylov solvers.
 
     Parameters
     ----------
     storage
-        The matrices.
+        The matrices B and C.
     solve
-        Solver with K.
+        Solver for systems with K.
     f, v
-        Two displacement vectors.
+        Work vectors: forces B^T x, and displacements K^-1 f.
     slopes
-        Derivative of the fluxes with respect to displacements, if it is included.
+        Derivative of the fluxes with respect to displacements, if the tangent includes it.
     """
 
     storage: StorageSystem
@@ -77,7 +77,7 @@ class SchurComplement:
     slopes: tuple[FluxSlope, ...] = ()
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Multiply."""
+        """Multiply x by S."""
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
         self.solve.solve(self.f, self.v)
@@ -89,14 +89,14 @@ class SchurComplement:
 
 @dataclass
 class Kept:
-    """Data shared by the tangents of a step; each step starts without any.
+    """Data that the tangents of a step share; each step starts without them.
 
     Parameters
     ----------
     operator
-        Whether the factors of the fixed-stress operator are still valid.
+        Whether the factors of the fixed-stress operator can be reused.
     factors
-        Direct solver that replaces multigrid, if any.
+        Direct solvers that replace multigrid, or None.
     """
 
     operator: bool = False
@@ -104,16 +104,16 @@ class Kept:
 
 
 class LinearSolvers:
-    """Solvers for the matrices of one active set.
+    """Linear solvers for the matrices of one set of active cells.
 
     Parameters
     ----------
     how
-        The plan, as `planned`.
+        Solver plan, see `planned`.
     scheme
         Coupling scheme.
     momentum, storage
-        Matrices and vectors; storage is None without fluid.
+        Matrices and vectors of the balances; storage is None without fluid.
     """
 
     def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
@@ -122,17 +122,17 @@ class LinearSolvers:
         self._momentum = momentum
         self._storage = storage
         self.tangent: Latest[bool] = Latest()
-        """Key of a tangent that the matrices keep from step to step."""
+        """Key of the tangent that the matrices keep over several steps."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
-        """Direction of the displacements, and a right-hand side."""
+        """Direction of the displacements, and a work vector for right-hand sides."""
         self._unread = set(scheme.petsc_options)
         with using(scheme.petsc_options, self._unread):
             self.solve_u = self._momentum_solver()
             if storage is None:
                 return
             self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
-            """Direction of the pressures, and a right-hand side."""
+            """Direction of the pressures, and a work vector for right-hand sides."""
             if how.route == AT_ONCE:
                 self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), False, how.coarsest)
                 self._block = BlockSolver(how, momentum, storage, (self.solve_u.pc, self._solve_s.pc))
@@ -152,7 +152,7 @@ class LinearSolvers:
             self._krylov = self._solve_s.getType()
 
     def _momentum_solver(self) -> PETSc.KSP:
-        """Return the solver for displacements."""
+        """Return the solver for systems with K."""
         how = self.plan
         K = self._momentum.K
         unknowns = self._momentum.unknowns
@@ -169,9 +169,9 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement, and its preconditioned solver; ValueError if the plan has none."""
+        """The Schur complement and its preconditioned solver; ValueError for monolithic multigrid, which has none."""
         if self._schur is None:
-            raise ValueError("solvers: multigrid solves for displacements and pressures at once, must be factors")
+            raise ValueError("solvers: monolithic multigrid has no Schur complement, must be direct solvers")
         return self._schur, self._solve_s
 
     def linearise(
@@ -182,16 +182,16 @@ class LinearSolvers:
         data: QuadratureData | None = None,
         firmness: NDArray[np.float64] | float = 0.0,
     ) -> bool:
-        """Assemble the tangents at (u, p), at the problems' integration points or others, and factorise them.
+        """Assemble the tangents at (u, p), and factorise them.
 
         Parameters
         ----------
         kept
-            Data shared by the tangents of the step.
+            Data that the tangents of the step share.
         data
-            Other integration points.
+            Integration points, by default the points of the problems.
         firmness
-            Added fraction of the elastic shear stiffness, one number or one for each part.
+            Fraction of the elastic shear stiffness to be added, one number or one for each connected part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
@@ -215,13 +215,13 @@ class LinearSolvers:
                     P = storage.assemble_preconditioner(self.scheme.beta, share)
                     self._solve_s.setOperators(self._schur, P)
                 factorise(self.solve_u.pc, self._solve_s.pc)
-                # no factors may be kept that a resumed run would lack
+                # a resumed run lacks factors of earlier steps: they must not be reused
                 kept.operator = not self.scheme.richardson and data is None
         self._tell_unread()
         return True
 
     def _tell_unread(self) -> None:
-        """Warn of options that no solver has read, after all solvers have been created."""
+        """Warn of options that no solver has read, once all solvers have been created."""
         if not self.scheme.petsc_options:
             return
         comm = self.du.comm.tompi4py()
@@ -238,14 +238,14 @@ class LinearSolvers:
         exchanged: NDArray[np.float64] | None = None,
         slope: FluxSlope | None = None,
     ) -> int:
-        """Solve for (du, dp) with the present residuals; return the coupling iterations.
+        """Solve for (du, dp) with the present residuals; return the number of coupling iterations.
 
         Parameters
         ----------
         kept
-            Data shared by the tangents of the step.
+            Data that the tangents of the step share.
         rtol
-            Relative accuracy of each part.
+            Relative tolerance, for each connected part.
         forces, exchanged : (parts,)
             Scales of the residuals: forces, N, and exchanged fluid volume, m^d.
         slope
@@ -258,7 +258,7 @@ class LinearSolvers:
             count = solved(self.solve_u, "momentum")
             return count if self.plan.iterative else 0
         if self._block is not None:
-            r = self._storage.residual  # scales with which Euclidean norms equal the errors
+            r = self._storage.residual  # scaled so that Euclidean norms equal the errors
             of = self._storage.of_parts
             size, total = of.norms(r.array_r), of.sums(np.abs(r.array_r))
             share = np.divide(size, total, out=np.ones(of.count), where=total > 0)
@@ -271,7 +271,7 @@ class LinearSolvers:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))
         g = self.condense(*slopes)
         self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
-        cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # it uses preconditioned norms
+        cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # CG uses preconditioned norms
         self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply if cg else None)
         self._schur.setPythonContext(self._context)
         self._follow()
@@ -287,9 +287,9 @@ class LinearSolvers:
         of: OfParts,
         measured: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
     ) -> None:
-        """Solve iteratively for x, with equal accuracy in all parts: each uncoupled part may have its own scale.
+        """Solve iteratively for x with equal relative accuracy in all parts, which may have different scales.
 
-        measured: maps the right-hand side b to the vector whose norm the solver takes; None: b itself.
+        measured: function that converts b to the vector whose norm the solver computes; None: b itself.
         """
         if of.count <= 1:
             ksp.solve(b, x)
@@ -303,26 +303,26 @@ class LinearSolvers:
         b.array_w[:] *= scale
         x.array_w[:] *= scale
 
-    def restrain(self, storage: StorageProblem, went: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
-        """Limit the fall of pressures along the direction as the storage requires, and adapt the displacements."""
+    def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
+        """Limit the decrease of pressures in the direction as the retention curves require; update displacements."""
         if not storage.forms.retains:
-            return went
-        dp, went = storage.restrained(self.dp.array_r, went)
+            return log_change
+        dp, log_change = storage.restrained(self.dp.array_r, log_change)
         far = not np.array_equal(dp, self.dp.array_r)
         if self.du.comm.tompi4py().allreduce(far, MPI.LOR):
             self.dp.array_w[:] = dp
             if self._block is None:
                 self._follow()
-        return went
+        return log_change
 
     def _follow(self) -> None:
-        """Solve for the displacements that go with the direction of the pressures."""
+        """Solve for the displacements that balance the direction of the pressures."""
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, self._momentum.residual)
         self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
-        """Reverse the direction in all parts, or in some (parts,)."""
+        """Reverse the direction in the given parts (parts,), or in all."""
         directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
         for direction, system in directions:
             if parts is None or parts.all():
@@ -331,20 +331,20 @@ class LinearSolvers:
                 direction.array_w[:] *= np.where(parts, -1.0, 1.0)[system.of_parts.of]
 
     def condense(self, *slopes: FluxSlope) -> PETSc.Vec:
-        """Return the right-hand side of the Schur complement's system, R_p - B K^-1 R_u."""
+        """Return the right-hand side R_p - B K^-1 R_u of the system with the Schur complement."""
         self.solve_u.solve(self._momentum.residual, self.du)
         self._storage.change_by(self.du, self._g, *slopes)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures, Pa, of the fixed-stress operator for fluid volumes of the owned cells, m^d."""
+        """Return P^-1 volumes, pressures, Pa: P is the fixed-stress operator, volumes, m^d, belong to owned cells."""
         self._g.array_w[:] = volumes
         self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r
 
     def solve_momentum(self) -> None:
-        """Solve for du alone, at fixed pressure."""
+        """Solve for du at fixed pressure."""
         if self._storage is not None:
             self.dp.set(0.0)
         if self.plan.iterative:
@@ -353,6 +353,6 @@ class LinearSolvers:
             self.solve_u.solve(self._momentum.residual, self.du)
 
     def solve_storage(self) -> PETSc.Vec:
-        """Return dp at fixed stress."""
+        """Solve for dp at fixed stress, and return it."""
         self._solve_s.solve(self._storage.residual, self.dp)
         return self.dp

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The choice of solvers: a function of the problem's properties, and the table of thresholds between routes.
+"""Choice of solvers: a function of the problem's properties, and the thresholds between methods.
 
-There are four routes for the linearised problem. Without fluid the momentum is solved alone. With fluid the
-displacements are eliminated (`schur`), or both problems are solved at once (`monolithic`) or in turn (fixed-stress
-iterations). Displacements have direct solvers, with a block for each node, by PETSc or MUMPS, or multigrid cycles.
+There are four methods for the linearised problem. Without fluid the momentum balance is solved alone. With fluid the
+displacements are eliminated (`schur`), or both balances are solved together (`monolithic`) or in turn (fixed-stress
+iterations). The solver for displacements is direct (PETSc, also with a block for each node, or MUMPS) or multigrid.
 """
 
 from __future__ import annotations
@@ -13,34 +13,34 @@ from dataclasses import dataclass
 FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by MUMPS", "multigrid"
 """Solvers for displacements or pressures."""
 ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at once", "in turn"
-"""Routes for the linearised problem."""
+"""Methods for the linearised problem."""
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds between routes; `bash demos/run.sh calibrate` times both sides of each.
+    """Thresholds between methods; `bash demos/run.sh calibrate` measures the times on both sides of each.
 
     multigrid_3d
         Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take, with
-        a direct solver and multigrid, s: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4 with 2600, 8.2 and 2.1 with 4900.
+        a direct solver and multigrid, s: 0.5 and 0.5 (1200 unknowns), 2.5 and 1.4 (2600), 8.2 and 2.1 (4900).
     multigrid_2d
-        The same in wet 2D scenes without yield. Linear algebra of a step of the beam takes, s: 0.06 and 0.05 with 10400
-        unknowns, 0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
+        As `multigrid_3d`, in wet 2D scenes without yield. Linear solvers in a step of the beam take, s: 0.06 and 0.05
+        (10400 unknowns), 0.19 and 0.14 (25500), 0.53 and 0.32 (51000), 2.3 and 1.0 (151000).
     mumps
         Number of unknown displacements of wet unsymmetric problems from which MUMPS is used, on all processes. Factors
-        and a solve take, with 196000 unknowns, s: PETSc 2.6 and 0.02, MUMPS with OpenBLAS 0.7 and 0.09; with 51000
-        unknowns 0.25 and 0.004, 0.12 and 0.02. A Newton step takes five to ten solves.
+        and a solve take, with 196000 unknowns: PETSc 2.6 and 0.02 s, MUMPS with OpenBLAS 0.7 and 0.09 s; with 51000
+        unknowns: PETSc 0.25 and 0.004 s, MUMPS 0.12 and 0.02 s. A Newton step takes five to ten solves.
     gathering
-        Largest number of processes with which one of them holds the factors for many solves. Making both factors on all
-        of four processes, which share the memory's bandwidth, took 1.7 times as long.
+        Largest number of processes for which a single one holds the factors of many solves. With both factorised
+        on all of four processes, which share the memory's bandwidth, the factorisations took 1.7 times as long.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
-        Iterations of a solve after which a direct solver replaces multigrid, or the next tangent renews the factors of
-        the fixed-stress operator. The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
+        Iterations of a solve above which a direct solver replaces multigrid, or the next tangent renews the factors of
+        the fixed-stress operator. For the latter, 12, 25, 50 and 500 give the same Newton steps (footing on 9 cells).
     coarsest
-        Largest number of unknowns of a grid with a direct solver.
+        Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
 
     multigrid_3d: int = 1500
@@ -56,25 +56,25 @@ THRESHOLDS = Thresholds()
 FORCING = 1e-5
 """Tightest relative tolerance of a linear solve.
 
-Plateau (soil): halved 4.0e-11, doubled 1.2e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.0e-11, twice by 1.2e-11, finer cells by 3.0e-02.
 """
 FORCING_3D = 1e-3
 """Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
-"""Largest ratio of successive residuals at which the tangent is kept for the next step.
+"""Largest ratio of successive residuals for which the next Newton step reuses the tangent.
 
-Plateau (soil): halved 4.9e-11, doubled 1.0e-11, cells 3.0e-02 (relative changes of the result).
+Sensitivity (soil scene): half the value changes the result by 4.9e-11, twice by 1.0e-11, finer cells by 3.0e-02.
 """
 KEEP_WET = 0.01
-"""The same in wet 2D scenes without yield.
+"""As `KEEP`, in wet 2D scenes without yield.
 
-Plateau (beam): halved 1.8e-11, doubled 2.9e-10, cells 1.5e-02 (relative changes of the result).
+Sensitivity (beam scene): half the value changes the result by 1.8e-11, twice by 2.9e-10, finer cells by 1.5e-02.
 """
 
 
 @dataclass(frozen=True)
 class SolverPlan:
-    """The solution method of the linearised problem.
+    """Solution method for the linearised problem.
 
     Parameters
     ----------
@@ -83,23 +83,23 @@ class SolverPlan:
     displacements, pressures
         Solvers for K and for the fixed-stress operator; pressures is "" without fluid.
     krylov
-        PETSc's name of the iterative solver, "preonly" for a direct solver alone.
+        PETSc's name of the iterative solver; "preonly" for a direct solver alone.
     fallback
-        Direct solver that replaces a multigrid cycle on K after many iterations; "" for none.
+        Direct solver that replaces the multigrid cycle on K after many iterations; "" if there is none.
     firmly
-        Whether multigrid smooths three times as often: for nearly incompressible bodies without a fallback.
+        Whether multigrid uses a stronger smoother: for nearly incompressible bodies without a fallback.
     gathered
         Whether one process holds the factors.
     symmetric
-        Whether the tangent of the momentum is symmetric.
+        Whether K is symmetric.
     many
-        Iterations of a solve after which new factors are made: see `Thresholds`.
+        Iterations of a solve above which new factors are computed: see `Thresholds`.
     coarsest
-        Largest number of unknowns of a grid with a direct solver.
+        Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     forcing
         Tightest relative tolerance of a linear solve; see `plan`.
     keep
-        Largest ratio of successive residuals at which the tangent is kept; see `plan`.
+        Largest ratio of successive residuals for which the tangent is reused; see `plan`.
     """
 
     route: str
@@ -117,7 +117,7 @@ class SolverPlan:
 
     @property
     def iterative(self) -> bool:
-        """Whether a multigrid cycle approximates K^-1, in place of factors."""
+        """Whether a multigrid cycle approximates K^-1."""
         return self.displacements == MULTIGRID
 
     def __str__(self) -> str:
@@ -143,15 +143,15 @@ def plan(
     processes: int = 1,
     coupling: str = "schur-cg",
 ) -> SolverPlan:
-    """Return the solution method of a problem.
+    """Return the solution method for a problem.
 
-    The tangent is kept while a Newton step reduces the residual to less than 0.05 of it, to 0.01 in 2D, wet and
-    elastic. The seed beam in 26 adaptive steps takes 205 Newton steps and 79 tangents with 0.05, 179 and 83 with 0.01,
-    174 and 94 with 0.002. In 3D, where tangents cost more, a beam takes up to a fifth longer with 0.01.
+    The tangent is reused while a Newton step reduces the residual to less than 0.05 of its value; to 0.01 in wet 2D
+    scenes without yield. The drained beam in 26 adaptive steps takes 205 Newton steps and 79 tangents with 0.05, 179
+    and 83 with 0.01, 174 and 94 with 0.002. In 3D tangents cost more: a beam takes up to a fifth longer with 0.01.
 
     The relative tolerance of linear solves is at least 1e-5, with multigrid in 3D 1e-3. With factors an iteration is
-    cheap, and a looser solve of the fluid's residual costs a Newton step: a footing on 21 cells (backward Euler) takes
-    299, 370 with 1e-3.
+    cheap, and a looser tolerance for the fluid costs Newton steps: a footing on 21 cells (backward Euler) takes 299
+    with 1e-5, 370 with 1e-3.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def plan(
     yields, locks
         Whether any law may yield; whether any law may yield or is nearly incompressible.
     symmetric
-        Whether the tangent of the momentum is symmetric.
+        Whether K is symmetric.
     processes
         Number of processes.
     coupling

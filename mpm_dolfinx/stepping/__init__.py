@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The step: scene, state, stages, and the algorithm."""
+"""Scene, state and stages, and the algorithm of a step."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The start of a step, and the two balances at the end of each substep."""
+"""Start of a step, and the two balances at the end of each substep."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Acting(NamedTuple):
-    """Loads of a substep; substep: time weights; t: end of the substep, s; gravity (d,): m/s^2, or None."""
+    """Loads of a substep; substep: time weights; t: end of the substep, s; gravity (d,), m/s^2, or None."""
 
     substep: Substep
     t: float
@@ -36,9 +36,9 @@ class Acting(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The start of a step of dt (s): the state on the grid, with integration points, matrices and loads.
+    """Start of a step of dt, s: the state on the grid, with integration points, matrices and loads.
 
-    yielded: whether soil has yielded before, on any process; renewed: number of renewed domains.
+    yielded: whether soil has yielded before, on any process; renewed: number of renewed particle domains.
     """
 
     state: State
@@ -50,24 +50,24 @@ class Start(NamedTuple):
     acting: list[Acting]
     renewed: int = 0
 
-    def begun(self, acting: Acting, gone: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep; gone: data of the loads from the previous substep."""
+    def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
+        """Return the loads at the beginning of a substep; earlier: their data from the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
-        before = gone or [None] * len(acting.loads)
+        before = earlier or [None] * len(acting.loads)
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
-        """Return a function for the velocities of points after the step, see `Mass.carried`; None without inertia."""
+        """Return a function for the points' velocities after the step, see `Mass.carried`; None without inertia."""
         if flight is None:
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return error and motion of the step, see `motion_error`, if the run needs them; else 0.
+        """Return error and motion of the step, see `motion_error`, if the run needs them, else 0.
 
-        flights: velocities after the substeps; substep: the last one.
+        flights: velocities after each substep; substep: the last substep.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -95,9 +95,9 @@ class Balances(NamedTuple):
         return self.storage.passing() if self.storage else []
 
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
-        """Return the outcomes of the conditions at the end of a step, see `State`.
+        """Return results of the conditions at the end of a step, by quantity and name, see `State`.
 
-        passed: flow in each substep, see `passing`; seconds: time weights, s, the last ones for the flows in `passed`.
+        passed: flow in each substep, see `passing`; seconds: time weights of the substeps, s.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
@@ -112,7 +112,7 @@ class Balances(NamedTuple):
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep; supports include their forces of a balanced initial stress."""
+    """Return the loads of each substep; supports then include their forces for a balanced initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -120,7 +120,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points after a step with their data of the loads; raise if a load forbids their positions."""
+    """Return the points after a step with the data that loads store; raise if a load forbids their positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:
@@ -138,7 +138,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether an extrapolation of the motion may start Newton's method: with yield, or quasi-static contact."""
+    """Return whether Newton's method may start from extrapolated motion: with yield, or with quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any(one.touches for one in loads))
 
@@ -146,11 +146,13 @@ def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
     """Return displacements (unknowns,), m, extrapolated from the previous substep or step.
 
-    They are a local array; None if they are unknown or useless: see `leads`.
+    The result is a local array; None if there is no previous motion, or if it is useless: see `leads`.
     """
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
         return substep.end / substep.own * scene.momentum.u.x.array
+    if start.state.trend is not None and not leads(scene, acting.loads):
+        return scene.motion.ahead(start.on_grid, start.state, float(substep.end * start.dt))
     velocity = start.state.velocity if substep.before == 0.0 else None
     return None if velocity is None else substep.end * start.dt * velocity
 
@@ -168,7 +170,7 @@ def balances(
 ) -> Balances:
     """Return the balances at the end of a substep, at the present u and p.
 
-    before: rates of the previous substep; flight: present velocities, with inertia.
+    before: rates of the previous substep; flight: present velocities, None without inertia.
     """
     substep = acting.substep
     on_grid = start.on_grid
@@ -182,7 +184,7 @@ def balances(
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
-        u = inertia.flight  # from other displacements inertia forces would hide the imbalance
+        u = inertia.flight  # other initial displacements cause inertia forces that hide the imbalance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)
@@ -199,6 +201,6 @@ def balances(
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
-    """Return the inertia forces (n, d), N/m^3, on the pore fluid in the filled owned cells at u."""
+    """Return the inertia forces (n, d), N/m^3, on the pore fluid in the filled owned cells, at u."""
     contents = on_grid.contents
     return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The reset of the grid: bodies cut by its cells, the active set, and matrices that are kept while a cut is valid.
+"""Reset of the grid: domains cut by the cells, active cells, and matrices that are reused while the pieces are valid.
 
-A step begins with it (`Scene.on_grid`), unless no corner has moved by more than a small part of a cell since the last
-reset. At the end of a step points only move (`advance`), and their pieces carry the pressures.
+A step begins with a reset (`Scene.on_grid`), unless no corner has moved by more than a small fraction of a cell since
+the last one. At the end of a step only the points move (`advance`), and their pieces store the pressures.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Returns values (m,) at positions (m, d), m, in local cells (m,)."""
+"""Function that returns values (m,) at positions (m, d), m, in local cells (m,)."""
 
 
 class OnGrid(Keyed):
@@ -53,7 +53,7 @@ class OnGrid(Keyed):
     quadrature
         Integration points of the scene.
     momentum, storage
-        Forms; their coefficients are set to the contents of the cells. Storage is None without fluid.
+        Forms; their coefficients are set from the material in the cells. Storage is None without fluid.
     cut
         The cut particle domains.
     of_fluid
@@ -89,7 +89,7 @@ class OnGrid(Keyed):
         """The cells that contain material."""
         self.cells = self.active.cells
         self.fill = np.zeros(grid.num_local)
-        """Volume fraction of the local cells."""
+        """Volume fraction of material in the local cells."""
         self.fill[self.cells] = momentum.ghost.fill.x.array[self.cells]
         self.facets = self.active.facets
         """Faces of this process between two active cells."""
@@ -97,7 +97,7 @@ class OnGrid(Keyed):
         """Faces with a ghost penalty."""
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
-        """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
+        """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the circumference, N/m."""
         np.maximum.at(self.stiffness, cut.cells, rows)
         self.contents = None
         self._mixed, self._borders = None, None
@@ -125,12 +125,12 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether cells mix several soils with a pressure-dependent ratio of conductivities."""
+        """Whether cells contain several soils with a pressure-dependent ratio of conductivities."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
-        """Inner faces of cells that are not full, which carry ghost mass."""
+        """Faces between active cells that have a ghost mass: at least one of the cells is not full."""
         return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
 
     @property
@@ -139,7 +139,7 @@ class OnGrid(Keyed):
         return self._quadrature.masses(self.cut.points)
 
     def data_of(self, state: State) -> QuadratureData:
-        """Return the integration points with the present data of the points, which have hardly moved."""
+        """Return the integration points with the present data of the material points, which have hardly moved."""
         if not state.stay:
             return self.data
         with _compat.Timer("integration data"):
@@ -161,7 +161,7 @@ class OnGrid(Keyed):
             bulk = self._storage.bulk
             retentions, new = self._quadrature.materials.retentions, self.cut.pieces
             rest = np.zeros(self.cut.grid.dim) if retentions is None else retentions.weight.value
-            old = state.pieces.potentials(bulk).less(rest)  # preserves hydrostatic states: S is not linear
+            old = state.pieces.potentials(bulk).less(rest)  # keeps hydrostatic states, although S is not linear
             carried = transport(old, self.cut.points, new) + new.x @ rest
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
@@ -173,10 +173,9 @@ class OnGrid(Keyed):
         return p[self.contents.filled]
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pressures (m,), Pa, of pieces with which the cells receive the water of the points.
+        """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
 
-        They are the pressures of potentials pi (m,), Pa, which preserve linear fields, corrected for each point's
-        water.
+        The mass potentials pi (m,), Pa, preserve linear fields; a constant for each point corrects their pressures.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -200,12 +199,12 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return data of the pieces in the state by name, and fresh values (m, ...) for pieces that do not stay."""
+        """Return data of the pieces by name: stored values where points keep their pieces, else `fresh` (m, ...)."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Give the integration points at the reset of the grid; within the context u is 0, and p as then."""
+        """Yield the integration points at the last reset; within the context u is 0, and p is that of the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -222,19 +221,19 @@ class OnGrid(Keyed):
                 values[rows] = before
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, of the pieces' cells at the start of a step."""
+        """Return the pressures (m,), Pa, in the cells of the pieces at the start of a step."""
         return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the cell pressures at the start of a step from values (m,), Pa, at the pieces."""
+        """Set the cell pressures at the start of a step from values (m,), Pa, in the pieces."""
         p_n = self._storage.p_n.x
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means in the filled owned cells of potentials (m,), Pa, of their pieces.
+        """Return the means (cells,), in the filled owned cells, of the pieces' potentials (m,), Pa.
 
-        The weight is the storage of the points, so their fluid is kept, or the volume in a cell without storage.
+        The weight is the points' storage, so that their fluid is conserved; in cells without storage the volume.
         """
         contents, points = self.contents, self.cut.points
         pieces = self.cut.pieces
@@ -253,13 +252,13 @@ class OnGrid(Keyed):
         water: PoreWater | None = None,
         at_rest: AtPlaces | None = None,
     ) -> list[NDArray[np.float64]]:
-        """Return pressures (m,), slopes (m, d), bounds (m, 2) at the pieces, from the cells' pressures.
+        """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
-        The mean of their mass potentials in a cell is the cell's. Its weight is `store` (m,), m^d/Pa, the storage of
-        the pieces, or the volume in a cell without storage. t, s: time of the pressures on drained sides.
+        The mean of the pieces' mass potentials in a cell is that of the cell. The weight is `store` (m,), m^d/Pa, the
+        storage of the pieces; in cells without storage the volume. t, s: time of the pressures on drained sides.
 
-        With `water`, its sum in a cell is preserved. The reconstruction then acts on differences from the hydrostatic
-        pressures `at_rest`, where fluid flows.
+        With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
+        hydrostatic pressures `at_rest`, if fluid can flow.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -275,7 +274,7 @@ class OnGrid(Keyed):
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
-        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be inclined in their cells
+        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be inclined to their cells
         pi = here[at] + share[at] * rise
         slope, bounds = (slope * share[:, None])[at], bounds[at]
         if at_rest is not None:
@@ -297,7 +296,7 @@ class OnGrid(Keyed):
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
     def due(self, state: State) -> NDArray[np.float64]:
-        """Return the correction of the volume defect in the filled owned cells in a step, m^d."""
+        """Return the correction of the volume defect in a step, m^d, in the filled owned cells."""
         cut, due = self.cut, state.points.volume0 * state.points.data["due"]
         share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
         return self.contents.total(self.data.pieces["biot"][:, 0] * share)
@@ -305,12 +304,12 @@ class OnGrid(Keyed):
     def pressures_up_to_surface(
         self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their volume mean in a cell is the cell's.
+        """Return the pressures (m,), Pa, at the pieces' centroids; their volume mean in a cell is that of the cell.
 
-        The reconstruction acts on differences from hydrostatic pressures, because there is no flow through no-flow
-        sides. In axisymmetry centroids and mean refer to the sections.
+        The reconstruction acts on differences from hydrostatic pressures, which cause no flow through sealed sides. In
+        axisymmetry centroids and mean refer to the sections.
 
-        t, s: time of the pressures on drained sides; at_rest: hydrostatic pressures, where fluid flows.
+        t, s: time of the pressures on drained sides; at_rest: hydrostatic pressures, if fluid can flow.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -323,9 +322,9 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return the data for slopes of cell pressures p (cells,), Pa, in terms of their mass potentials.
+        """Return cell pressures p (cells,), Pa, as mass potentials, with the data from which slopes are computed.
 
-        bulk: bulk modulus of the fluid, Pa; at_rest: hydrostatic pressures, which are subtracted.
+        bulk: bulk modulus of the fluid, Pa; at_rest: hydrostatic pressures that are subtracted.
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
@@ -342,7 +341,7 @@ class OnGrid(Keyed):
         return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
-        """Return the mobility of the filled owned cells at u; begins: raise an error for invalid values."""
+        """Return the mobility of the filled owned cells at u; begins: whether invalid values raise ValueError."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
@@ -354,7 +353,7 @@ class OnGrid(Keyed):
     def _relative_mobility(
         self, full: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
     ) -> Mobility:
-        """Return the mobility of cells in unsaturated soil, from saturated values at their pieces (m,), m^2/(Pa s)."""
+        """Return the mobility of cells in unsaturated soil; full (m,): saturated mobility of pieces, m^2/(Pa s)."""
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
@@ -370,7 +369,7 @@ class OnGrid(Keyed):
         return replace(mobility, paths=self._mixed.paths(full, law, count, mobility.shift), **given)
 
     def pore_water(self, points: MaterialPoints) -> PoreWater | None:
-        """Return the water in the pieces with the porosities of the points, in unsaturated soil; arrays by cells."""
+        """Return the pore water of the pieces in unsaturated soil, with the points' porosities; else None."""
         materials, cut = self._quadrature.materials, self.cut
         if materials.retentions is None:
             return None
@@ -382,12 +381,12 @@ class OnGrid(Keyed):
 
     @property
     def heads(self) -> NDArray[np.float64]:
-        """Pressures (m,) of unsaturated pieces less their cells' pressures, Pa."""
+        """Pressures of unsaturated pieces minus pressures of their cells (m,), Pa."""
         return self._quadrature.materials.retentions.heads(self._places.lever)
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suction scale of drainage in the filled owned cells, Pa, 1 in saturated ones; None if all are saturated."""
+        """Suction at which pores drain in the filled owned cells, Pa, 1 if saturated; None in saturated scenes."""
         if self._quadrature.materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -396,24 +395,24 @@ class OnGrid(Keyed):
         return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
-        """Return the conductivities, m/s, of the filled owned cells in the reference configuration."""
+        """Return the conductivities of the filled owned cells in the reference configuration, m/s, as mobility."""
         at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
         mean = self.contents.mean(at_pieces)
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells whose points all stay in their cut; None if no point does."""
+        """Return the filled owned cells in which all points keep their pieces; None if no point does."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return whether each point (n,) stays in its cut: its part hardly moves; groups are tested together."""
+        """Return which points (n,) keep their pieces: their connected part hardly moves. Groups are tested together."""
         all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
-        if all_of_them or self.cut.grid.copies > 1:
+        part, count = (0, 1) if all_of_them or self.cut.grid.copies > 1 else self.parts
+        if count == 1:
             return np.full(len(points), all_of_them)
-        part, count = self.parts
         return self.cut.valid(points, part, count)[part]
 
     @cached_property
@@ -435,7 +434,7 @@ class OnGrid(Keyed):
 
 
 class System:
-    """Vectors, matrices and solvers of one active set.
+    """Vectors, matrices and solvers for one set of active cells.
 
     Parameters
     ----------
@@ -450,7 +449,7 @@ class System:
     stiff
         Whether plates or prescribed displacements have a penalty.
     symmetric
-        Whether the momentum's tangent is symmetric.
+        Whether the tangent of the momentum is symmetric.
     """
 
     def __init__(
@@ -481,14 +480,14 @@ class System:
         return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
-        """Drop coarse grids without a kept tangent, to free memory before the points move."""
+        """Delete coarse grids without a kept tangent, to free memory before the points move."""
         if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
             del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
 
 
 class Assembled(Keyed):
-    """Data that are kept while a cut is valid and a stage lasts: penalties and fluxes, in the matrices of a system.
+    """Data that are kept while pieces and stage stay the same: penalties and fluxes, in the matrices of a system.
 
     Parameters
     ----------
@@ -501,7 +500,7 @@ class Assembled(Keyed):
     stage
         The conditions.
     loads
-        Loads at the positions of the cut.
+        Loads at the positions at which domains were cut.
     """
 
     def __init__(
@@ -539,19 +538,18 @@ class Assembled(Keyed):
         if self.storage is not None:
             self.storage.set_alternation()
             if (form := storage.fluxes.nonorthogonal) is not None:
-                facets = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
-                self._off = facets if facets.some else None
+                self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
         self._gradients: Latest[Gradients] = Latest()
 
     @property
     def solvers(self) -> LinearSolvers:
-        """The solvers of the system."""
+        """The linear solvers of the system."""
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return the rounding error of the residual at the active local nodes (nodes,), N.
 
-        It is proportional to the stiffness of the cells at a node, and to the stiffness of the loads.
+        The error is proportional to the stiffness of the cells at a node, and to the stiffness of the loads.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
@@ -565,9 +563,9 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function that assembles the fluxes at u as a step begins, or later.
+        """Return the fluid conditions, and a function that returns the fluxes at u; argument: whether a step begins.
 
-        Fluxes at the start are kept where points stay in their cells, and only u could change them.
+        Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 
         Parameters
         ----------
@@ -580,7 +578,7 @@ class Assembled(Keyed):
         t
             Time of the pressures and fluxes on open sides, s.
         dt
-            The step, s.
+            Length of the step, s.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -635,12 +633,12 @@ def assembled(
     loads: Sequence[Loads],
     begins: bool,
 ) -> Assembled:
-    """Return the matrices of a cut and a stage; begins: refuse any part of the bodies that is not held.
+    """Return the matrices for cut domains and a stage; begins: raise an error if a part of a body lacks support.
 
     Raises
     ------
     ValueError
-        A body, or at the start of a stage a part of one, has a free rigid-body mode.
+        A body, or at the start of a stage a part of a body, has a free rigid-body mode.
     """
     grid, free = on_grid.cut.grid, stage.free
     dofs = momentum.active.now.dofs[free[momentum.active.now.nodes].ravel()]
@@ -648,7 +646,7 @@ def assembled(
 
     def make() -> System:
         if not stage.inertia and not any(one.holding for one in loads):
-            check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
+            check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
         return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells

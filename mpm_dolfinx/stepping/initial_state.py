@@ -1,56 +1,316 @@
 # SPDX-License-Identifier: MIT
-"""The initial state: given stresses and pore pressures, balanced with the loads.
+"""State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
 
-Given stresses and the scheme's error leave out-of-balance forces. Steps of the momentum balance at fixed pressures
-remove these forces. Their deformation adds to the elastic strain of the points, whose positions do not change.
+Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
+pressures remove these forces. Their deformation adds to the elastic strain of the points. Positions do not change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF
+from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF, SAME
+from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import pressure_at
+from mpm_dolfinx.bodies.faces import Surface, surface
+from mpm_dolfinx.bodies.fills import put, touches
+from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Loads, Place
-from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.conditions.conditions import Quiet
+from mpm_dolfinx.conditions.sides import everywhere
+from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
+from mpm_dolfinx.contact.groups import contacts_of
+from mpm_dolfinx.domains.fitted import fitted_at
+from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
+from mpm_dolfinx.dynamics.at_rest import balancing_tractions
+from mpm_dolfinx.dynamics.quiet_sides import QuietSides, traction_name
 from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import strained
+from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.mechanics.tractions import owners
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
 from mpm_dolfinx.stepping.scene import Scene, When
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Mixed iterations; the iteration ends after PATIENCE ones that do not reduce the residual by the factor LESS.
+"""Number of mixed iterations; the iteration ends after PATIENCE iterations that do not reduce the residual by LESS.
 
-A wet bank, its law elastic or frictional, blocks on a rough base, a half held one: forces left 4e-5 to 3e-9 with 40 and
-16 and with 80 and 24, in as many iterations; with 40 and 8 up to 6e-3.
+Tests: a wet bank, elastic or frictional, blocks on a rough base, one of them half supported. With 40 and 16 and with 80
+and 24 the remaining forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Change of stress in the balance, over the largest given stress, from which a warning is given.
+"""Change of stress by balancing / largest given stress, above which a warning is given.
 
-Also the largest relative residual of the forces, due to the scheme's error.
+Also the largest relative residual of the forces, due to errors of the discretisation.
 """
+
+
+def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
+    """Return the state of a scene in its first stage, with given stresses that are not balanced yet."""
+    present = [body not in later for body in range(len(scene.bodies))]
+    check_apart(scene.grid, scene.bodies, present)
+    first = _stage(scene, conditions, present, later)
+    if scene.initial.given and (quiet := first.of(Quiet)):
+        raise ValueError(
+            f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
+        )
+    comm, gravity = scene.grid.comm, first.conditions["gravity"]
+    warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
+    if scene.fluid and scene.materials.conducts:
+        warn_units(comm, scene.fluid, gravity)
+    points = scene.materials.seeded.of(scene.ids(present))
+    points = scene.initial.of(scene.materials, points, present, first.gravity_at(0.0) if scene.initial.given else None)
+    pieces = None
+    scene.rests_at(first, 0.0)
+    if scene.fluid:
+        placed = callable(scene.initial.pressure) or scene.materials.retentions is not None
+        pieces = pieces_at_start(scene, points) if placed else at_start(points)
+    return State(
+        t=0.0,
+        points=_gripped(scene, first, points),
+        pieces=pieces,
+        outcome=first.unknown(np.nan if scene.initial.given else 0.0),
+        stage=first,
+    )
+
+
+def begin_stage(
+    scene: Scene,
+    state: State,
+    named: Mapping[str, Any],
+    add: Sequence[int],
+    remove: Sequence[int],
+    reset_displacement: bool,
+    fields: Mapping[str, ArrayLike],
+) -> State:
+    """Return the state at the beginning of a stage, see `Simulation.stage`; named: new conditions."""
+    before = state.stage
+    if "gravity" in named and scene.gravity is None:
+        raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
+    if "inertia" in named:
+        flag("stage: inertia", named["inertia"])
+        if scene.momentum.inertia is None:
+            raise ValueError("stage: inertia: the scene has none; for changes it must be created with inertia=False")
+    chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
+    chosen("stage: add", add, list(before.later), "bodies that are still to be added")
+    flag("stage: reset_displacement", reset_displacement)
+    present = [(is_present and body not in remove) or body in add for body, is_present in enumerate(before.present)]
+    later = [body for body in before.later if body not in add]
+    conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
+    after = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    if "gravity" in named or waters(after.given) != waters(before.given):
+        warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
+    if remove:
+        _warn_moved_on(scene, before, after)
+    new_quiet = {name: one for name, one in after.of(Quiet).items() if name not in after.same(before)}
+    if new_quiet and before.inertia:
+        raise ValueError(f"{next(iter(new_quiet))}: must act from the first stage in which its bodies have inertia")
+    state, tractions = _released(scene, state, after, new_quiet) if new_quiet else (state, {})
+    scene.rests_at(before, state.t)
+    state = scene.followed(state)
+    if state.stays:  # points have the pressures of their cells, not of their pieces
+        state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    state = replace(state, stay=None)
+    own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
+    removed, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
+    standing = [body for body, is_present in enumerate(before.present) if is_present and body not in remove]
+    bare, gravity = _without_data(state.points, before.data_names(before.named)), None
+    if scene.initial.given:
+        gravity = after.gravity_at(state.t)
+    if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
+        what = f"stage: add: body {add[0]}: domains of others have been renewed"
+        raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
+    bare = _without_extra(scene, bare, add, fields) if add else bare
+    points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
+    others = before.data_names(before.named.keys() - after.same(before))
+    points = _gripped(scene, after, points, _without_data(state.points, others))
+    for name, (ids, values) in tractions.items():
+        known, at = points.find(ids)
+        rows = points.data[name].copy()
+        rows[at] = values[known]
+        points = replace(points, data=points.data | {name: rows})
+    if pieces is not None:
+        pieces = pieces.of(removed, kept=False).joined(at_start(new))
+    points = _changed(scene, points, fields)
+    if after.inertia and not before.inertia:
+        points = replace(points, data=points.data | resting(points))
+    if reset_displacement:
+        points = replace(points, origin=points.corners)
+    outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
+    rest = state.rest if _holds_as(after, before) else None
+    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest, "trend": None}
+    return replace(state, points=points, pieces=pieces, **new)
+
+
+def _released(
+    scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
+) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
+    """Return a state before the next step, and tractions on new quiet sides: points (m,) and (m, d), Pa, by data name.
+
+    The tractions balance stresses, loads of the previous stage, and remaining supports. begun: the new stage.
+    """
+    start = set_up(scene, state, 0.0)
+    state, momentum = start.state, scene.momentum
+    when, given = When(state.t, 1.0, start.acting[-1].gravity, 1.0, 0.0), (start.data, start.acting[-1].loads)
+    problem = scene.balance(when, start.matrices.momentum, *given, held=state.held)
+    forces = problem.unbalanced().reshape(-1, scene.grid.dim)
+    surfaces = next(of for of in after.acting if isinstance(of, QuietSides)).named(quiet)
+    cut = start.on_grid.cut
+
+    def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
+        """Return the components (nodes, d) along `axes` at nodes of cells that contain the faces `some`."""
+        nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
+        return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
+
+    now, then = ~after.free, ~state.stage.free
+    for of, held in ((after, now), (state.stage, then)):
+        for _, faces, axes in of.held:
+            held |= near([faces], axes)
+    counts = ~now & (near(list(surfaces.values()), range(scene.grid.dim)) | ~then)
+    owned = momentum.u.function_space.dofmap.index_map.size_local
+    given = scene.grid.comm, list(map(len, scene.bodies)), state.points
+    stresses = {
+        name: fitted_at(*given, faces.id, faces.xi.mean(axis=1), scene.materials.total_stress)
+        for name, faces in surfaces.items()
+    }
+    parts = start.matrices.momentum.parts
+    found = balancing_tractions(cut, state.points, stresses, surfaces, parts, (forces * counts)[:owned], now)
+    return state, {traction_name(name): of for name, of in found.items()}
+
+
+def _gripped(
+    scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
+) -> MaterialPoints:
+    """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
+    kept = after.kept(len(points))
+    if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
+        raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
+    if before is not None:
+        known, at = before.find(points.id)
+        for name in kept.keys() & before.data.keys():
+            kept[name][known] = before.data[name][at]
+    return replace(points, data={**points.data, **kept}) if kept else points
+
+
+def _without_data(points: MaterialPoints, names: Collection[str]) -> MaterialPoints:
+    """Return the points without the data of these names."""
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
+
+
+def _holds_as(after: Stage, before: Stage) -> bool:
+    """Return whether the same conditions support the same faces."""
+    return len(after.held) == len(before.held) and all(
+        hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
+        for (hold, faces, _), (was, then, _) in zip(after.held, before.held, strict=True)
+    )
+
+
+def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
+    """Return the conditions with the scene's contacts, which stages cannot change."""
+    standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
+    if given and given != standing:
+        raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
+    return [*conditions, *(() if given else standing)]
+
+
+def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+    feeding = scene.storage.feeding if scene.storage else ()
+    return stage(scene.bodies, scene.materials, scene.momentum, feeding, conditions, present, later)
+
+
+def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
+    """Warn of each unchanged condition that also acts on faces that an excavation has exposed."""
+    stop = np.cumsum([len(body) for body in scene.bodies])
+    for name, condition in after.given.items():
+        if not hasattr(condition, "side") or before.given.get(name) is not condition:
+            continue
+        where = condition.side, getattr(condition, "region", None)
+        was, now = (surface(scene.bodies, *where, s.present) for s in (before, after))
+        bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
+        was_present = np.repeat(before.present, [len(body) for body in scene.bodies])
+        new = np.flatnonzero(was_present[now.id] & (bare[now.id] > SAME * now.whole0))
+        if len(new):
+            area = bare[np.unique(now.id[new])].sum()
+            what = "stage: remove: %s is unchanged and now also acts on %.3g m^%d of newly exposed faces, first at %s"
+            values = line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0)
+            warn(scene.grid.comm, ConditionWarning, what, *values)
+
+
+def _filled(
+    scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
+) -> tuple[MaterialPoints, MaterialPoints]:
+    """Return all points with added bodies, and the points of these bodies alone; a body is placed after its base."""
+    standing = list(standing)
+    waiting = list(add)
+    new = scene.materials.seeded.of(np.empty(0, np.int64))
+    while waiting:
+        fill = next((body for body in waiting if touches(scene.bodies, standing, body)), waiting[0])
+        placed = scene.materials.seeded.of(scene.ids(np.arange(len(scene.bodies)) == fill))
+        placed = put(scene.grid, scene.bodies, standing, fill, points, placed)
+        placed = scene.initial.of(
+            scene.materials, placed, [i in (*standing, *add) for i in range(len(scene.bodies))], gravity
+        )
+        if scene.momentum.inertia is not None:
+            placed = replace(placed, data=placed.data | resting(placed))
+        points, new = points.joined(placed), new.joined(placed)
+        standing.append(fill)
+        waiting.remove(fill)
+    return points, new
+
+
+def _without_extra(
+    scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
+) -> MaterialPoints:
+    """Return the points without data from earlier stages, which added bodies do not have."""
+    extra = points.data.keys() - scene.materials.seeded.data.keys()
+    for name in sorted(extra - fields.keys()):
+        what = f"stage: add: body {add[0]}: its points have no {name!r}"
+        raise ValueError(f"{what}, must be given for all points in fields=")
+    return _without_data(points, extra)
+
+
+def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
+    """Return the points with new values of the data named in `fields`."""
+    instance("stage: fields", fields, Mapping)
+    data = dict(points.data)
+    for name, value in fields.items():
+        if name not in data and name in scene.materials.constants:
+            law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
+            allowed = f"given to it as a function of position, lambda X: np.full(len(X), {value}), to be changed"
+            raise ValueError(f"stage: fields: {name!r}: a constant of {law}, must be {allowed}")
+        new, what = numbers(f"stage: fields: {name}", value, None, allowed="finite numbers"), f"stage: fields: {name!r}"
+        if name in data and new.shape == data[name].shape[1:]:
+            new = np.broadcast_to(new, data[name].shape)
+        if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
+            each = "one value for all, or " if name in data else ""
+            raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+        data[name] = new.copy()
+    points = replace(points, data=data)
+    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of pieces for a pressure field; cells have the field's values at their centroids."""
+    """Return the pressures of the pieces for a pressure field; cells have the field's values at their centroids."""
     on_grid = scene.on_grid(points)
     grid = scene.grid
     pressure = scene.initial.pressure
@@ -64,30 +324,30 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     held = contents.total(store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
     mean = contents.total(weight * pi) / contents.total(weight)
-    wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
-    pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
+    target = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
+    pi = pi + (mass_potential(target, bulk) - mean)[contents.slot(cut.cells)]
     p = pressure_of(pi, bulk)
     water = on_grid.pore_water(points)
     if water is not None:
-        offset = p - wanted[water.slot]
-        p = water.level(water.of_cells(wanted[water.slot] + on_grid.heads), wanted, offset)[water.slot] + offset
+        offset = p - target[water.slot]
+        p = water.level(water.of_cells(target[water.slot] + on_grid.heads), target, offset)[water.slot] + offset
     p = cut.to_pieces(p)
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
     return PiecePressures(points.id[pieces.point], pieces.cell, pieces.fraction, p, pieces.x, 0 * pieces.x, bounds)
 
 
 def balanced(scene: Scene, state: State) -> State:
-    """Return a state with stresses in equilibrium with the loads at its time, at its pore pressures.
+    """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
-    A displacement w of the grid is balanced with the strains of the pieces; points keep the mean strain of their
+    A displacement w of the grid is balanced with the strains of the pieces. Points store the mean strain of their
     domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes: nodal forces hold the remainder, `State.held`. Support forces are evaluated at the
-    displacement w, `State.rest`: the sides keep their seeded positions, whatever is prescribed at the start.
+    strains cannot balance all nodes; nodal forces balance the remainder, `State.held`. Support forces are evaluated at
+    the displacement w, `State.rest`: sides keep their seeded positions for any prescribed displacement at the start.
 
     Raises
     ------
     ValueError
-        The laws admit no such equilibrium.
+        There is no equilibrium with these laws.
     """
     forms, materials = scene.momentum, scene.materials
     try:
@@ -136,9 +396,9 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes of the balance; refuse a large relative residual.
+    """Log the changes by balancing; raise ValueError for a large relative residual.
 
-    Contact (touches) is found in the first step only: a residual is then a warning.
+    With contact (touches), which is detected only in the first step, a large residual causes a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -155,13 +415,13 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a displacement of the nodes, m, a local array; it is zero outside the cells of supported sides."""
+    """Return a displacement w of the nodes, m, a local array, set to zero outside the cells of supported sides."""
     nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
     return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the balance of momentum at zero displacement and zero rates, for points strained by u."""
+    """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
@@ -170,7 +430,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
 
 
 def _as_reset(scene: Scene, start: Start) -> State:
-    """Return the state at the start, as after a reset of the grid without motion."""
+    """Return the state at the start, in the form after a reset of the grid without motion."""
     cut, pieces = start.on_grid.cut, None
     if scene.storage is not None:
         p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
@@ -180,7 +440,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration from earlier ones and their steps; local arrays, m."""
+    """Return the next displacement of a fixed-point iteration; seen: earlier displacements and steps, local arrays."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

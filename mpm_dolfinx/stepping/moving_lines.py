@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that follow: chosen at each reset of the grid from the state alone, so a resumed run chooses the same."""
+"""Grid lines that move with a body or tool: each reset computes them from the state, so a resumed run repeats them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from mpm_dolfinx.stepping.state import State
 
 
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
-    """Return the state for its next step, with the lines of that step, on which the grid is put.
+    """Return the state for its next step, and move the grid to the lines of that step.
 
-    A kept cut ends when any line moves by more than `STILL` cells, the motion of corners that ends it as well.
+    All domains are cut anew if any line moves by more than `STILL` cells, the limit for the motion of corners.
 
     Parameters
     ----------
     left
-        Returns a state whose points all stay, without its kept cut; called with the grid on the state's lines.
+        Function that returns a state ready for a reset; called while the grid has the state's lines.
     """
     before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
     grid.move(before)
@@ -48,12 +48,12 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 
 
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
-    """Return the lines (n,), m, along each axis that belong to a state, relative to the base."""
+    """Return the coordinates (n,), m, of the grid lines along each axis for a state, relative to the base."""
     if hasattr(grid.follow, "pose"):
         for name, one in state.stage.given.items():
             if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
-                way = one.pose(state.t, grid.dim, state.outcome["tool_travel"][name]).shift
-                return carried(grid.seeded, way)
+                shift = one.pose(state.t, grid.dim, state.outcome["tool_travel"][name]).shift
+                return carried(grid.seeded, shift)
         return before
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
     lines = grid.from_base(
@@ -66,7 +66,7 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
 
 
 def _of_all(grid: Grid, state: State) -> NDArray[np.float64]:
-    """Return the true positions (n, d), m, of the points of all processes, by number."""
+    """Return the true positions (n, d), m, of the points of all processes, ordered by number."""
     found = grid.comm.allgather((state.points.id, state.points.x))
     ids, x = (np.concatenate(values) for values in zip(*found, strict=True))
     return x[np.argsort(ids)] + grid.base

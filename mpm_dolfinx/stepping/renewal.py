@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of the particle domains of flowing soil at a reset of the grid.
+"""Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-Yielded soil updates F by increments, so its domains serve for integration only. They may be replaced if the new ones
-fill the same region, keep its surface, and have the same contents. If a domain is longer than a cell, its cells are
-filled anew:
+F of yielded soil is updated by increments, so domains serve for integration only. They may be replaced if the new
+domains fill the same region, with the same surface and contents. Cells of a domain longer than a cell are filled anew:
 
-* a full cell with its halves along each axis;
-* a cell that the surface crosses once with quadrilaterals about the centroid of the filled part. The surface there
-  becomes `EDGES` edges, with the same ends, area and sharp corners.
+* A full cell is divided into four equal domains.
+* A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
+  there becomes `EDGES` edges, with the same ends, area and sharp corners.
 
-The parts of old domains outside these cells are cut off and kept. Masses, volumes and the mass of the fluid are exact
-in each cell. So are sums by mass of other data of points, the logarithm of the elastic left Cauchy-Green tensor among
-them: means over the overlap, shifted to the new centroids by fitted slopes, within the range of values. Cells with
-elastic soil, several bodies, prescribed displacements, or several crossings of the surface are left alone.
+Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
+each cell. Mass-weighted sums of other point data are exact too, also of the logarithm of the elastic left Cauchy-Green
+tensor. These data are means over the overlap, shifted to the new centroids by fitted slopes, within the range of the
+values. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings are unchanged.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import FACES, centroids, volumes
@@ -42,20 +41,20 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain in cells: longer ones would bend, but their edges are straight. Source: definition."""
+"""Largest length of a domain in cells: longer domains should bend, but have straight edges. Source: definition."""
 
 
 class Renewal:
-    """Renews the particle domains of a scene.
+    """Renewal of the particle domains in a scene.
 
     Parameters
     ----------
-    grid, bodies, materials
-        Grid, bodies and materials of the scene.
+    bodies, materials
+        Bodies and materials of the scene.
     """
 
-    def __init__(self, grid: Grid, bodies: Sequence[Body], materials: SceneMaterials):
-        self._grid = grid
+    def __init__(self, bodies: Sequence[Body], materials: SceneMaterials):
+        self._grid = materials.grid
         self._bodies = bodies
         self._starts = np.cumsum([0, *map(len, bodies)])
         self._materials = materials
@@ -76,35 +75,35 @@ class Renewal:
         return OuterFaces(*(column[order] for column in columns))
 
     def _faces(self, points: MaterialPoints) -> OuterFaces:
-        """Return the outer faces of points."""
+        """Return the outer faces of the points."""
         seeded = self._outer
-        here, at = points.find(seeded.point)
-        columns = [(at, *(v[here] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
+        known, at = points.find(seeded.point)
+        columns = [(at, *(v[known] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
         if PARENT in points.data:
             at, face = np.nonzero(points.data[PARENT] >= 0)
             columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
 
     def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return the domains (n,) that are longer than `LONGEST` cells, or partly inverted."""
+        """Return which domains (n,) are longer than `LONGEST` cells, or partly inverted."""
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return the points (n,) that have yielded, with a law whose elastic strain is known."""
+        """Return which points (n,) have yielded, with a law that has an elastic strain tensor."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return the points (n,) that may be renewed: without probes, and not in a part of the bodies that rests."""
+        """Return which points (n,) may be renewed: without probes, and not in a part that keeps its pieces."""
         free = self.flowed(state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps
 
     def renewed(self, state: State) -> tuple[State, int]:
-        """Return the state with renewed domains, and the number of replaced ones. The call is collective.
+        """Return the state with renewed domains, and the number of replaced domains; all processes must call it.
 
         After a renewal the first process has all points. A failure raises NotConverged on all processes.
         """
@@ -142,7 +141,7 @@ class Renewal:
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, touched)
         kept = ~work.affected
-        gone = points.id[work.affected]
+        replaced = points.id[work.affected]
         stay, pieces = state.stay, state.pieces
         if stay is not None:
             rows = _joined(stay.points, made, kept)
@@ -153,26 +152,26 @@ class Renewal:
             brought = at_start(replace(made, pressure=pressure))
             if pieces.of_cell is not None:
                 brought = replace(brought, of_cell=pressure, start=pressure)
-            pieces = pieces.of(gone, kept=False).joined(brought)
-        return replace(state, points=_joined(points, made, kept), pieces=pieces, stay=stay), len(gone)
+            pieces = pieces.of(replaced, kept=False).joined(brought)
+        return replace(state, points=_joined(points, made, kept), pieces=pieces, stay=stay), len(replaced)
 
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, of new domains, which give their cells the fluid of the old ones.
+        """Return the pressures (m,), Pa, of new domains, so that their cells contain the fluid of the old domains.
 
-        They are means in each group, (m,) of the new domains: by storage, or by volume if nothing is stored.
+        group (m,): group of each new domain. Pressures are means in each group: by storage, or if zero by volume.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
-        there = transport(old.potentials(bulk), points, pieces)
+        potential = transport(old.potentials(bulk), points, pieces)
         piece, groups, share = work.into
         of, count = pieces.point[piece], int(group.max()) + 1
-        lost = pieces.fraction.copy()
-        lost[piece] = 0.0  # slivers, which go to the others of their domain
-        whole, held = (sum_by(pieces.point, lost * values, len(points)) for values in (1.0, there))
+        others = pieces.fraction.copy()
+        others[piece] = 0.0  # very thin pieces, which are added to the others of their domain
+        whole, held = (sum_by(pieces.point, others * values, len(points)) for values in (1.0, potential))
         mean = np.divide(held, whole, out=np.zeros(len(points)), where=whole > 0)[of]
-        brings = pieces.fraction[piece] * there[piece] + (share - pieces.fraction[piece]) * mean
+        brings = pieces.fraction[piece] * potential[piece] + (share - pieces.fraction[piece]) * mean
 
         def over(values: NDArray, weight: NDArray) -> NDArray:
             return sum_by(groups, values * weight[of], count)
@@ -185,7 +184,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of all outer faces, and a number for the conditions on each; -1 if it may not be renewed."""
+        """Return the keys of all outer faces, and a number for the conditions on each face; -1: not to be renewed."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -203,11 +202,11 @@ class Renewal:
     def _filled(
         self, points: MaterialPoints, work: RefilledCells, new: Sequence[New], touched: Sequence[str]
     ) -> MaterialPoints:
-        """Return the points of the new domains."""
+        """Return the material points of the new domains."""
         corners, group, parent, area, ends = (np.concatenate(column) for column in zip(*new, strict=True))
         old, at, share = work.pairs(corners, group)
         piece, groups, part = work.into
-        gone = work.pieces.point[piece]
+        source = work.pieces.point[piece]
         n, mass = len(corners), points.volume0
         J = points.J
         weight = share * mass[old]
@@ -218,7 +217,7 @@ class Renewal:
 
         size = np.abs(volumes(corners))
         count = int(group.max()) + 1
-        M, V = (sum_by(groups, part * of[gone], count) for of in (mass, mass * J))
+        M, V = (sum_by(groups, part * of[source], count) for of in (mass, mass * J))
         A = sum_by(group, size, count)
 
         def mean(values: NDArray) -> NDArray:
@@ -228,8 +227,8 @@ class Renewal:
             means = np.stack([sum_by(at, weight * column, n) / total for column in flat[old].T], axis=1)
             means = means + np.einsum("ni,nik->nk", off, work.slopes(flat, group))
             low, high = np.full((count, flat.shape[1]), np.inf), np.full((count, flat.shape[1]), -np.inf)
-            np.minimum.at(low, groups, flat[gone])
-            np.maximum.at(high, groups, flat[gone])
+            np.minimum.at(low, groups, flat[source])
+            np.maximum.at(high, groups, flat[source])
             return np.clip(means, low[group], high[group]).reshape(n, *values.shape[1:])
 
         like = np.exp(mean(np.log(J)))
@@ -238,16 +237,16 @@ class Renewal:
         volume0 = V[group] * size / A[group] / ratio
 
         def kept(values: NDArray) -> NDArray:
-            """Return means whose sum by mass is exact, too: the room that is left within the values is shared."""
+            """Return means whose sum by mass is exact: the defect is distributed within the range of the values."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
-                missing = sum_by(groups, part * (mass * of)[gone], count) - sum_by(group, volume0 * column, count)
+                missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
                 end = np.full(count, np.inf), np.full(count, -np.inf)
-                np.minimum.at(end[0], groups, of[gone])
-                np.maximum.at(end[1], groups, of[gone])
-                room = np.where(missing > 0, end[1], end[0])[group] - column
-                whole = sum_by(group, volume0 * room, count)
-                column += np.divide(missing, whole, out=np.zeros(count), where=whole != 0)[group] * room
+                np.minimum.at(end[0], groups, of[source])
+                np.maximum.at(end[1], groups, of[source])
+                margin = np.where(missing > 0, end[1], end[0])[group] - column
+                whole = sum_by(group, volume0 * margin, count)
+                column += np.divide(missing, whole, out=np.zeros(count), where=whole != 0)[group] * margin
             return means.reshape(n, *values.shape[1:])
 
         material = np.zeros(n, dtype=points.material.dtype)
@@ -286,7 +285,7 @@ class Renewal:
         )
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points `rows`."""
+        """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points with indices `rows`."""
         F = np.tile(np.eye(3), (len(rows), 1, 1))
         seen = points.F_of_laws[rows]
         F[:, : seen.shape[1], : seen.shape[1]] = seen
@@ -294,7 +293,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the kept points (n,), and new ones."""
+    """Return the points for which kept (n,) is true, together with the new points `made`."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 
@@ -309,9 +308,9 @@ def _exp(e: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return C_p^-1 (n, 3, 3) of elastic left Cauchy-Green tensors b (n, 3, 3) at F."""
+    """Return C_p^-1 (n, 3, 3) for elastic left Cauchy-Green tensors b (n, 3, 3) and F."""
     whole = np.tile(np.eye(3), (len(F), 1, 1))
     seen = F if across is None else in_space(F, across)
     whole[:, : seen.shape[1], : seen.shape[1]] = seen
-    back = np.linalg.inv(whole)
-    return back @ b @ back.swapaxes(1, 2)
+    inverse = np.linalg.inv(whole)
+    return inverse @ b @ inverse.swapaxes(1, 2)

@@ -13,46 +13,45 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.tables import data_frame, data_set
-from mpm_dolfinx.conditions.acting import MOTIONS
+from mpm_dolfinx.conditions.acting import MOTIONS, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
-OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", *MOTIONS, "energy")
-OUTCOMES += ("runoff", "flowed", "ran_off", "ponded")
-"""Outcomes of the conditions of the package; user-defined conditions may have others."""
+OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", "runoff", "flowed", "ran_off", "ponded")
+"""Quantities of the package's conditions; user-defined conditions may have others."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """Histories of a run, with one row for each output time, the start included.
+    """Histories of a run, with one row for each output time, including the start.
 
-    Histories are read-only arrays (n, ...) over n output times. Quantities that were not recorded have an axis of
-    length 0: (n, 0, d) without probes.
+    Histories are read-only arrays (n, ...) for n output times. Quantities that were not recorded have an axis of length
+    0: (n, 0, d) without probes.
 
     Parameters
     ----------
     rows
         Records at the output times, see `Row`.
     steps, newton, coupling, cuts, rejected
-        Counts so far: steps, Newton and coupling iterations, steps cut for convergence, steps refused for their error.
+        Counts so far: steps; Newton and coupling iterations; steps reduced to converge, and rejected by their error.
     rederived
-        Inverted domains that were re-initialised from F.
+        Number of inverted domains that were re-initialised from F.
     renewed, renewals
-        Renewed domains of yielded soil, and resets of the grid with renewal.
+        Number of renewed domains of yielded soil, and of resets of the grid with renewal.
     balance, residual
-        Largest relative errors so far of the fluid balance, and of the two problems.
+        Largest relative errors so far: of the fluid balance, and residuals of the two balances.
     wall, profile
-        Time, s, of the whole run, and of each part of it on this process.
+        Wall time, s, of the whole run, and of each part of it on this process.
     converged
-        Whether the end has been reached.
+        Whether the run has reached its end.
     event
-        Index in `until`, from 0, of the function that ended the run, and its time, s; None if none did.
+        Index in `until`, from 0, of the function that ended the run, and its time, s; None without an event.
     points, memory, imbalance
-        Values at the end of the run: material points; peak memory of all processes with libraries, MB; (largest load of
-        a process) / (mean load).
+        Values at the end of the run: number of material points; peak memory of all processes with libraries, MB;
+        (largest load of a process) / (mean load).
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
-    """Rows of the output times."""
+    """Results at the output times, one row each."""
     steps: int = 0
     newton: int = 0
     coupling: int = 0
@@ -94,7 +93,7 @@ class Result:
 
     @property
     def pressure(self) -> NDArray[np.float64]:
-        """Least and largest pore pressure (n, 2) on the points, Pa; (n, 0) without fluid."""
+        """Least and largest pore pressure (n, 2) of the material points, Pa; (n, 0) without fluid."""
         return self.rows.column("pressure")
 
     @property
@@ -104,17 +103,17 @@ class Result:
 
     @property
     def probe_stress(self) -> NDArray[np.float64]:
-        """Effective stresses (n, m, 3, 3) at the probes, Pa, tension positive; (n, 0, 3, 3) where not asked for."""
+        """Effective stresses (n, m, 3, 3) at the probes, Pa, tension positive; (n, 0, 3, 3) if not recorded."""
         return self.rows.column("probe_stress")
 
     @cached_property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Forces (times, d), N, of each prescribed displacement on the bodies, by name."""
+        """Force (times, d), N, of each prescribed displacement on the bodies at the output times, by name."""
         return self.outcome("reactions")
 
     @cached_property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Forces (times, d), N, of each wall of the grid on the bodies at the output times; see `Simulation`."""
+        """Force (times, d), N, of each wall of the grid on the bodies at the output times; see `Simulation`."""
         return self.outcome("wall_reactions")
 
     @cached_property
@@ -124,30 +123,30 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces and moments (times, d + 1), in 3D (times, 6), N and N m, of each tool and contact, by name."""
+        """Force, N, and moment, N m, (times, d + 1), in 3D (times, 6), of each tool and contact, by name."""
         return self.outcome("tool_forces")
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement (times,), m, of each load-controlled tool beyond its prescribed displacement, by name."""
+        """Displacement (times,), m, of each load-controlled tool, without its prescribed displacement, by name."""
         return self.outcome("tool_travel")
 
     @cached_property
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        kinetic and elastic belong to the bodies and free tools; elastic is 0 for laws without an energy. The others
-        count from the start of the run: external is the work of all loads, viscous the work on quiet sides and
-        user-defined terms, friction the work of slip on tools and between groups, internal the work of the stresses;
-        dissipated is the part of internal that is not elastic, in wet bodies with the work of flow and storage of
-        water. kinetic + elastic + dissipated + viscous + friction - external is constant, up to losses of the method.
+        kinetic and elastic belong to the bodies and free tools; elastic is 0 for laws without an energy. Others are the
+        work since the start of the run: external of all loads; viscous on quiet sides and by user-defined terms;
+        friction of slip at tools and between groups; internal of the stresses. dissipated is internal minus elastic,
+        in wet bodies with the work of flow and storage of water. kinetic + elastic + dissipated + viscous + friction -
+        external is constant, up to losses of the method.
         """
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return an outcome (n, ...) of the conditions at the output times, by name, such as "reactions".
+        """Return the results (n, ...) of conditions at the output times, by name; quantity: such as "reactions".
 
-        nan at times without the condition.
+        Values are nan at times without the condition.
         """
         rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
@@ -156,15 +155,15 @@ class Result:
     def to_dataframe(self):
         """Return the histories as a pandas data frame, one row for each output time, with the columns of `history.csv`.
 
-        Its `attrs["units"]` has the unit of each column. ImportError if pandas is not installed.
+        `attrs["units"]` of the frame contains the unit of each column. ImportError if pandas is not installed.
         """
         return data_frame(self, {name: self.outcome(name) for name in OUTCOMES})
 
     def to_xarray(self):
         """Return the histories as an xarray data set, with units as attributes of its variables.
 
-        Dimensions are time, probe and axis, for stresses at probes row and column; variables of conditions have their
-        names. Its attributes are the counts of the run. ImportError if xarray is not installed.
+        Dimensions are time, probe and axis; stresses at probes have row and column. Variables of conditions have the
+        conditions' names. The data set's attributes are the counts of the run. ImportError if xarray is not installed.
         """
         counts = {name: getattr(self, name) for name in ("steps", "newton", "cuts", "balance", "residual", "wall")}
         return data_set(self, {name: self.outcome(name) for name in OUTCOMES}, counts)
@@ -188,7 +187,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return time, s, and fraction of the wall time of each part, memory and imbalance as a table."""
+        """Return a table of the time, s, of each part and its fraction of the wall time, memory and imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run
@@ -201,9 +200,9 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """The end of a run by a step that fails, however short.
+    """Error that ends a run: a step fails at any length.
 
-    The simulation is in the state of the last good step. Other conditions or other steps may continue from there.
+    The simulation is in the state of the last good step. A new run may continue it with other conditions or steps.
 
     Attributes
     ----------

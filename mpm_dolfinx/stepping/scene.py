@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A compiled scene: grid, bodies, materials and forms, which last from the first step to the last."""
+"""A compiled scene: grid, bodies, materials and forms, which are the same in all steps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
-from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.initial_stress import InitialStresses
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
@@ -47,9 +46,9 @@ from mpm_dolfinx.stepping.state import State
 
 
 class When(NamedTuple):
-    """A substep: its end, s, time since the start of the step, s, and gravity (d,), m/s^2, or None.
+    """A substep: time at its end, s; time since the start of the step, s; gravity (d,), m/s^2, or None.
 
-    own: time weight of the rate at its end, s; past: fraction of the displacement at its start, see `Velocity`.
+    own: weight of the rate at its end, s; past: fraction of the displacement at its start, see `Velocity`.
     """
 
     t: float
@@ -60,22 +59,22 @@ class When(NamedTuple):
 
 
 class Scene:
-    """A compiled scene. It is the same in all steps: the data that differ between steps are in the `State`.
+    """A compiled scene, the same in all steps; data that differ between steps are in the `State`.
 
     Parameters
     ----------
     grid, bodies, materials, fluid, numerics
         See `Simulation`.
     weighs
-        Whether there is gravity.
+        Whether the scene has gravity.
     pressure
         Initial pore pressure, Pa, or a function of position.
     extensions
         User-defined terms in the balance of momentum, and in the storage of fluid.
     initial
-        Stresses of bodies as seeded, see `initial_stress.by_body`.
+        Initial stresses of bodies, see `initial_stress.by_body`.
     velocity
-        Initial velocity, m/s, of a scene whose bodies may have inertia, see `Simulation`; else None.
+        Initial velocity, m/s, if bodies may have inertia, see `Simulation`; else None.
     """
 
     def __init__(
@@ -106,16 +105,13 @@ class Scene:
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
-        """Time at the end of the substep, and since the start of the step, s, for forms."""
+        """Time at the end of the substep, and time since the start of the step, s, as constants of forms."""
         inside = [term for term in terms if not isinstance(term, OnSide)]
-        self.pieces = QuadraturePoints(grid, scene, bodies, fluid, weighs, bool(len(inside) + len(sources)))
+        self.pieces = QuadraturePoints(scene, bodies, weighs, bool(len(inside) + len(sources)))
         laws, p = self.pieces.laws, CellPressure(*(fem.Function(grid.cellwise()) for _ in range(3))) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
-            wet = fluid.density if fluid else None
-            options = (self.gravity, wet, scene.symmetric)
-            options = (*options, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
-            options = (*options, scene.retentions)
-            self.momentum = MomentumForms(self.pieces.pieces, laws, p and p.now, *options)
+            options = (scene, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
+            self.momentum = MomentumForms(self.pieces.pieces, laws, p and p.now, self.gravity, *options)
         if scheme.coupling == "schur-cg" and not (self.momentum.symmetric and scene.retentions is None):
             scheme = replace(scheme, coupling="schur-fgmres")
         self.scheme, self.storage = scheme, None
@@ -125,21 +121,17 @@ class Scene:
             moves = self.momentum.inertia
             inertial = None if moves is None else -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
             pieces = self.pieces.pieces
-            u = self.momentum.u
-            laws = scene.conductivity_laws
-            law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
-            kind = (symmetric, scene.conducts, scene.evolves)
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
-            of_fluid = (fluid.bulk, weight, *kind, law, feeding, inertial, scene.retentions)
-            self.storage = StorageForms(pieces, u, p, self.momentum.active, *of_fluid)
+            of_fluid = (scene, weight, symmetric, feeding, inertial)
+            self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
-        # pending checks for warnings, which affect the log only
+        # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
         self._renewed: Latest[tuple[dict[str, Any], int]] = Latest()
-        _ = self._renewal  # refuses scenes without support for it
+        _ = self._renewal  # raises ValueError for scenes that do not support renewal
 
     @property
     def flows(self) -> bool:
@@ -148,7 +140,7 @@ class Scene:
 
     @property
     def substeps(self) -> tuple[Substep, ...]:
-        """Substeps of a step."""
+        """Substeps of each step."""
         return substeps(
             self.numerics.method, self.flows or self.momentum.own.rates or self.momentum.inertia is not None
         )
@@ -162,7 +154,7 @@ class Scene:
         u: NDArray[np.float64] | float | None = None,
         **options,
     ) -> MomentumProblem:
-        """Return the balance of momentum at the end of a substep; all coefficients of its forms are set.
+        """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
 
         Parameters
         ----------
@@ -171,7 +163,7 @@ class Scene:
         system, data, loads, options
             See `MomentumProblem`.
         u : (unknowns,), m
-            Displacements at which the iterations begin, a local array; None: the present ones.
+            Displacements at which the iterations begin, a local array; None: the present displacements.
         """
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
@@ -186,11 +178,11 @@ class Scene:
 
     @cached_property
     def _warned(self) -> set[str]:
-        """Subjects of past warnings, which affect the log only."""
+        """Subjects of earlier warnings; they affect only the log."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Warn, once, if the gravity of a step differs from that of the conductivities."""
+        """Warn, once, if the gravity of a step differs from the gravity that defines the conductivities."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
@@ -202,25 +194,26 @@ class Scene:
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        It is the weight in `stage` at the start t (s) of a step; a varying gravity resets the grid in each step.
+        It is the weight in `stage` at the start t, s, of a step; with varying gravity each step resets the grid.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def check(self, state: State) -> None:
-        """Refuse an object that is not a state of this scene: its conditions act on the materials of another one."""
+        """Raise ValueError for an object that is no state of this scene: its stage refers to other materials."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
     def on_grid(self, points: MaterialPoints) -> OnGrid:
-        """Return the bodies on the grid, reset for these points."""
+        """Return the bodies on the grid, reset for the given points."""
         grid = self.grid
 
         def make() -> OnGrid:
-            self._assembled.clear()  # its coefficients change now
+            self._assembled.clear()  # coefficients of its forms change now
             with _compat.Timer("cut domains"):
-                cut = CutDomains(grid, points, self.numerics.quadrature == "domain", self.momentum.inertia is not None)
+                more = self.momentum.inertia is not None, self.storage is not None
+                cut = CutDomains(grid, points, self.numerics.quadrature == "domain", *more)
                 self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
             with _compat.Timer("integration data"):
                 problems = (self.momentum, self.storage)
@@ -230,7 +223,7 @@ class Scene:
         return self._on_grid((points.arrays, lines), make, grid.comm)
 
     def followed(self, state: State) -> State:
-        """Return the state for its next step, with the lines of that step, on which the grid is put."""
+        """Return the state for its next step, and move the grid to the lines of that step."""
         if self.grid.follow is None:
             return state
         state = with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
@@ -239,7 +232,7 @@ class Scene:
 
     @cached_property
     def _renewal(self) -> Renewal | None:
-        """Renews particle domains; None without renewal."""
+        """Renewal of particle domains; None if it is off."""
         grid = self.grid
         if not self.numerics.renewal:
             return None
@@ -255,12 +248,12 @@ class Scene:
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
             raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain")
-        return Renewal(grid, self.bodies, self.materials)
+        return Renewal(self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
 
-        renew: whether renewal is allowed. A state whose points all stay is returned as it is.
+        renew: whether renewal is allowed. A state in which all points keep their pieces is returned as it is.
         """
         if state.stays:
             return state, 0
@@ -288,9 +281,9 @@ class Scene:
         now
             Present loads.
         as_cut
-            Returns the loads at the positions of the cut.
+            Function that returns the loads at the positions at which domains were cut.
         begins
-            Whether all parts of the bodies must be held.
+            Whether all parts of the bodies must have supports.
         """
 
         def make() -> Assembled:
@@ -299,13 +292,13 @@ class Scene:
 
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
-    def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
-        """Return the numbers of all points of the bodies that are present."""
-        return np.flatnonzero(np.repeat(present, [len(body) for body in self.bodies]))
+    def ids(self, chosen: Sequence[bool]) -> NDArray[np.int64]:
+        """Return the numbers of all points of the chosen bodies."""
+        return np.flatnonzero(np.repeat(chosen, [len(body) for body in self.bodies]))
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """The constants that define the scene, by name: a checkpoint is identified by them."""
+        """Constants that define the scene, by name; they identify a checkpoint."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         if not grid.even:
@@ -325,7 +318,7 @@ class Scene:
         for name, one in {**materials, "fluid": self.fluid}.items():
             out[name] = None if one is None else type(one).__name__
             constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-            laws = ("retention",)  # identified by its values, in the checksums
+            laws = ("retention",)  # the checksums identify a law by its values
             given = {key: value for key, value in constants.items() if key not in laws and value is not None}
             constants = {key: value for key, value in given.items() if not callable(value)}
             out |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
@@ -333,10 +326,10 @@ class Scene:
 
     @property
     def last(self) -> tuple[OnGrid | None, Assembled | System | None]:
-        """The bodies as last cut, and the matrices of the last step, for inspection."""
+        """The bodies as last cut by the grid, and the matrices of the last step, for inspection."""
         return self._on_grid.value, self._assembled.value or self._systems.value
 
     def forget(self) -> None:
-        """Drop all data of a step: it may have been interrupted anywhere."""
+        """Delete all data of a step, which may have been interrupted anywhere."""
         for made in (self._assembled, self._systems, self._on_grid):
             made.clear()

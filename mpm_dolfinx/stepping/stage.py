@@ -32,17 +32,17 @@ from mpm_dolfinx.conditions.conditions import (
 from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
-from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.pairing import Contacts
 from mpm_dolfinx.contact.ties import Ties
 from mpm_dolfinx.contact.tool import Tool
+from mpm_dolfinx.contact.tool_placing import Tools
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides
 from mpm_dolfinx.flow.drained_sides import DrainedSides
 from mpm_dolfinx.flow.feeding import Feeding
 from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.materials.skeleton import Fluid
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
@@ -57,12 +57,12 @@ KINDS: tuple[type[Acting], ...] = (
     GivenDisplacements,
     QuietSides,
     Ties,
-    ToolsOfStage,
-    ContactsOfStage,
+    Tools,
+    Contacts,
 )
-"""Loads on the momentum, for conditions without a method `acting`."""
+"""Loads in the balance of momentum, for conditions without a method `acting`."""
 FED: tuple[type[Feeding], ...] = (DrainedSides,)
-"""Fluid conditions, for conditions without a method `feeding`."""
+"""Terms in the balance of fluid, for conditions without a method `feeding`."""
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
@@ -82,12 +82,12 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The active conditions.
+    """The conditions of a stage.
 
-    given: conditions by name, as they were given; named: the same, with the unit weight of water from the pore fluid;
-    conditions: walls, including the axis, and gravity; present: whether each body is present; later: bodies that may
-    still be added; free (nodes, d): components that no wall fixes; axisymmetric: see `Grid`; lattices: lattices of
-    present bodies; materials: the scene's; acting: loads on the momentum; feeding: conditions on the fluid.
+    given: conditions by name, as given; named: the same, with the unit weight of water of the pore fluid.
+    conditions: walls, with the axis, and gravity; present: whether each body is present; later: bodies to be added.
+    free (nodes, d): whether walls leave each component free; axisymmetric: see `Grid`; materials: the scene's.
+    lattices: of present bodies; acting: loads in the balance of momentum; feeding: terms in the balance of fluid.
     """
 
     given: Mapping[str, Condition]
@@ -109,16 +109,16 @@ class Stage:
 
     @property
     def surfaces(self) -> list[Surface]:
-        """The faces of all conditions except tools and contacts."""
+        """Faces of all conditions except tools and contacts."""
         return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
 
     @property
     def faces(self) -> list[Surface]:
-        """The faces of all conditions, including the faces that tools may touch."""
+        """Faces of all conditions, including the faces that tools may touch."""
         return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of some classes by name."""
+        """Return the conditions of the given classes, by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     @property
@@ -128,25 +128,25 @@ class Stage:
 
     @property
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
-        """Conditions that support faces, with these faces and the axes."""
+        """Conditions that support faces, each with its faces and axes."""
         return [one for acting in self.acting for one in acting.held]
 
     def placed(self, place: Place) -> list[Loads]:
-        """Return the loads on the momentum in a substep."""
+        """Return the loads in the balance of momentum in a substep."""
         with _compat.Timer("loads"):
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Refuse a stage that cannot begin at this place."""
+        """Raise an error if the stage cannot begin at this place."""
         for one in self.acting:
             one.check_start(place)
 
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
-        """Return the initial data of the conditions at n points."""
+        """Return the initial values of point data that conditions store, for n points."""
         return {data: rows for one in self.acting for of in one.kept(n).values() for data, rows in of.items()}
 
     def data_names(self, names: Collection[str]) -> set[str]:
-        """Return the names of point data of the conditions with these names."""
+        """Return the names of point data that the conditions `names` store."""
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
@@ -155,7 +155,7 @@ class Stage:
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return outcomes of this value, before the first step."""
+        """Return results of conditions, by quantity and name, all equal to `value`, before the first step."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -169,8 +169,10 @@ class Stage:
                 out[quantity] = out.get(quantity, {}) | values
         return out
 
-    def begun(self, before: Stage, outcome: Outcome, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outcome at the beginning of the stage after another one; new conditions have this value."""
+    def initial_outcome(
+        self, before: Stage, outcome: Outcome, value: float
+    ) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the results of conditions at the beginning of the stage; for new conditions `value`."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
@@ -180,14 +182,14 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy, J, of free tools from an outcome."""
+        """Return the kinetic energy, J, of free tools; outcome: results of conditions, with the tools' velocities."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
         return sum(m / 2 * float((v**2).sum()) for m, v in moving)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
-        """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
+        """Return the acceleration of gravity (d,), m/s^2, at time t, s; None without gravity."""
         gravity = self.conditions["gravity"]
         name = f"gravity at t = {t:g} s"
         d = self.free.shape[1]
@@ -197,10 +199,8 @@ class Stage:
 
 
 def stage(
-    grid: Grid,
     bodies: Sequence[Body],
     materials: SceneMaterials,
-    fluid: Fluid | None,
     momentum: MomentumForms,
     fed: Sequence[Feeding],
     conditions: Mapping[str, Any],
@@ -211,29 +211,26 @@ def stage(
 
     Parameters
     ----------
-    grid, bodies
-        Background grid, and all bodies of the scene.
-    materials
-        Materials of the scene.
-    fluid
-        Pore fluid, if there is one.
+    bodies, materials
+        All bodies and materials of the scene.
     momentum, fed
-        Forms with the loads of all stages; fluid conditions of all stages.
+        Forms with the loads of all stages; terms of all stages in the balance of fluid.
     conditions
-        walls, conditions, gravity: see `Simulation`.
+        walls, conditions, gravity and inertia: see `Simulation`.
     present, later
-        Whether each body is present, and bodies that may still be added.
+        Whether each body is present; indices of bodies still to be added.
 
     Raises
     ------
     ValueError
-        An invalid condition; the message has its name, its value and the allowed values.
+        A condition is invalid; the message has its name, its value and the allowed values.
     """
+    grid, fluid = materials.grid, materials.fluid
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
     if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
-        raise ValueError("drained and inflow sides need a fluid")
+        raise ValueError("conditions: drained or inflow sides without fluid, must be in a scene with fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -247,10 +244,10 @@ def stage(
     sides = Sides(grid, bodies, present)
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
-    feeding += [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
+    feeding += [kind(setting, some) for kind in FED if (some := setting.of(*kind.conditions))]
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
-    acting += [kind(setting, mine) for kind, mine in found if mine]
+    acting += [kind(setting, some) for kind, some in found if some]
     lattice = lattices(bodies, present, [(faces, axes) for one in acting for _, faces, axes in one.held])
     return Stage(
         given=given_by_name,
@@ -272,7 +269,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Refuse conditions that do not support inertia, and conditions that need it."""
+    """Raise ValueError for conditions that do not support inertia, or that require it in a quasi-static stage."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
@@ -292,11 +289,11 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
 
 
 def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
-    """Return the components (nodes, d) that walls fix."""
+    """Return which components (nodes, d) walls fix."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
     if not isinstance(walls, Mapping):
-        raise ValueError(f"walls = {line(walls)}, must be walls with their components, such as {{'left': 'xy'}}")
+        raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
     for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
             raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The state of a scene: its complete memory between two steps."""
+"""State of a scene: all data that one step passes to the next."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpm_dolfinx.stepping.step_memory import StepControl
 
 
 def _freeze(kept: Mapping[str, Any]) -> None:
-    """Make all arrays read-only."""
+    """Make all arrays of a mapping read-only."""
     for values in kept.values():
         if isinstance(values, np.ndarray):
             values.flags.writeable = False
@@ -33,12 +33,12 @@ def _freeze(kept: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stay:
-    """The kept cut: points that have hardly moved since the last reset of the grid stay in the cells that cut them.
+    """Reused pieces: points that have hardly moved since the last reset of the grid keep the pieces of their domains.
 
     points
         The material points at the reset of the grid.
     keeps : (n,)
-        Points for which the cut is valid, in parts of the bodies that hardly move. None: all points.
+        Whether each point keeps its pieces; its part of the bodies then hardly moves. None: all points.
     """
 
     points: MaterialPoints
@@ -48,54 +48,81 @@ class Stay:
         _freeze(vars(self))
 
     def migrated(self, exchange: Exchange) -> Stay:
-        """Return the kept cut after an exchange of points."""
+        """Return the same data after an exchange of points between processes."""
         keeps = self.keeps
         if keeps is not None:
             keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
         return Stay(self.points.migrated(exchange), keeps)
 
 
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Motion of the points in the last step or two.
+
+    lengths : (k,)
+        Lengths of the steps, s, the last one first.
+    rates : (n, k, d, 1 + d)
+        Mean rates of x, m/s, and of F, 1/s, in each of them.
+    """
+
+    lengths: NDArray[np.float64]
+    rates: NDArray[np.float64]
+
+    def __post_init__(self):
+        _freeze(vars(self))
+
+    def over(self, seconds: float) -> NDArray[np.float64]:
+        """Return the changes (n, d, 1 + d) of x, m, and F in a time (s), by the parabola through the last states."""
+        rate = self.rates[:, 0]
+        if len(self.lengths) > 1:
+            rate = rate + (seconds + self.lengths[0]) / self.lengths.sum() * (rate - self.rates[:, 1])
+        return seconds * rate
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
-    """The complete memory of a scene between two steps; immutable. A step makes a new one.
+    """All data of a scene that one step passes to the next; immutable, as a step returns a new state.
 
-    A checkpoint holds all of it but the stage, which the script defines, and the watched points, which a run sets anew.
+    A checkpoint stores these data, except the stage, which the script defines, and the watched points of a run.
 
     t
         Time, s.
     points
-        The material points of this process, with positions relative to the grid's `base`. A state does not accept
-        `Simulation.points`, which have true positions: `PlacedPoints.from_base` converts them.
+        Material points of this process, with positions relative to the grid's `base`. A state does not accept
+        `Simulation.points`, which have true positions; `PlacedPoints.from_base` converts them.
     pieces
         Pressures of the pieces of the particle domains, for the transfer to the next grid; None without fluid.
     stay
-        The kept cut; None if the next step resets the whole grid.
+        Points that keep their pieces; None if the next step resets the whole grid.
     resets
         Number of resets of the grid.
     lines
-        Lines (n,), m, by axis "x", "y", "z", of the last reset of a grid that follows, relative to its `base`; None
-        before, and for other grids.
+        Coordinates (n,), m, of grid lines by axis "x", "y", "z", at the last reset of a grid with moving lines,
+        relative to its `base`; None before, and for other grids.
     outcome
-        Outcomes of the conditions at the end of the last step, by quantity and name; nan for new conditions before the
-        first step of a stage. reactions (d,), N, of prescribed displacements; wall_reactions (d,), N, of the grid's
-        walls; outflows, m^3/s (m^2/s in plane strain), volumes at zero pressure through open sides; tool_forces (d +
-        1,), in 3D (6,), N and N m, forces and moments of tools and contacts on the bodies; tool_travel, m,
-        displacements of load-controlled tools beyond the prescribed ones; and outcomes of user-defined conditions.
+        Results of conditions at the end of the last step, by quantity and name; nan for new conditions before the first
+        step of a stage. reactions (d,), N, of prescribed displacements; wall_reactions (d,), N, of the grid's walls;
+        outflows, m^3/s (m^2/s in plane strain), through open sides, as volumes at zero pressure; tool_forces (d + 1,),
+        in 3D (6,), N and N m, of tools and contacts on the bodies; tool_travel, m, displacements of load-controlled
+        tools without the prescribed ones; and results of user-defined conditions.
     stage
-        The active conditions.
+        The present stage, with its conditions.
     begins
-        Whether the stage has had no step yet.
+        Whether the stage has had no step so far.
     velocity : (unknowns,), m/s
-        Nodal velocities of this process in the last step, ghosts included: an initial guess for Newton's method with
-        yield or contact. None before the first step, and without either.
+        Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
+        or contact. None before the first step, and without yield or contact.
+    trend
+        Motion in the last steps: an initial guess in dry elastic bodies. None before the first step of a stage, and in
+        other scenes.
     held : (unknowns,), N
-        Nodal forces of this process, ghosts included, for the imbalance of an initial stress due to the scheme's error.
-        None without, after a new stage, and after a reset of the grid.
+        Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
+        forces, after a new stage, and after a reset of the grid.
     rest : (unknowns,), m
-        Nodal displacement of this process, ghosts included, at which prescribed displacements and plates have their
-        forces of an initial stress. None after a stage that changes them, and after a reset of the grid.
+        Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
+        initial stress. None after a stage that changes these conditions, and after a reset of the grid.
     watched : (m,)
-        Numbers of points with probes in their domains, which are not renewed.
+        Numbers of points with probes in their domains, which renewal does not replace.
     result, control
         Histories of the last run, and its step control; None before the first run.
     """
@@ -110,6 +137,7 @@ class State:
     stage: Stage
     begins: bool = True
     velocity: NDArray[np.float64] | None = None
+    trend: Trend | None = None
     held: NDArray[np.float64] | None = None
     rest: NDArray[np.float64] | None = None
     watched: NDArray[np.int64] | None = None
@@ -118,26 +146,26 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points are at true positions, must count from the grid's base: points.from_base")
+            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property
     def stays(self) -> bool:
-        """Whether all points stay in the cells that cut them."""
+        """Whether all points keep their pieces."""
         return self.stay is not None and self.stay.keeps is None
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """The points at the positions where the next step cuts them: as before for points that stay."""
+        """Points at the positions at which the next step cuts them; at the last reset if they keep their pieces."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return data of the pieces by name where they stay, and fresh values (m, ...) elsewhere.
+        """Return data of the pieces by name where points keep their pieces, and `fresh` (m, ...) elsewhere.
 
         point : (m,)
-            Point of each piece; points that stay keep their pieces.
+            Index of the point of each piece.
         """
         if self.stay is None:
             return fresh
@@ -149,16 +177,18 @@ class State:
         return out
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
-        """Return the state after every point, with its pieces, has moved to its destination (n,), a rank."""
+        """Return the state after every point has moved to the process destination (n,), with its pieces."""
         exchange = Exchange(comm, destination)
         pieces = self.pieces
         if pieces is not None:
             pieces = pieces.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pieces.id)]))
-        stay = self.stay and self.stay.migrated(exchange)
-        return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay)
+        stay, trend = self.stay and self.stay.migrated(exchange), self.trend
+        if trend is not None:
+            trend = Trend(trend.lengths, exchange.send(trend.rates)[np.argsort(exchange.send(self.points.id))])
+        return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay, trend=trend)
 
     def at_owners(self, grid: Grid) -> State:
-        """Return the state with points and pieces at the processes that own their cells."""
+        """Return the state with points and pieces on the processes that own their cells."""
         if grid.comm.size == 1:
             return self
         placed = self.as_cut

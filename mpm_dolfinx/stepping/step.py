@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One step of a scene: the algorithm, in its only place."""
+"""One step of a scene: the complete algorithm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
-    """Return the start of a step of dt (s): the state on the grid, matrices, and the loads of the substeps."""
+    """Return the start of a step of dt, s: the state on the grid, matrices, and the loads of the substeps."""
     scene.check(state)
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
@@ -30,7 +30,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     state, renewed = scene.for_reset(scene.followed(state), dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
-    on_grid.cut.surfaces(stage.surfaces)  # cut together
+    on_grid.cut.surfaces(stage.surfaces)  # all faces are cut together
     data = on_grid.data_of(state)
     place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome, stage.inertia)
     if state.begins:
@@ -46,15 +46,15 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
-    """Return the state after a step of dt (s), and its report; `state` is unchanged, even after an error."""
+    """Return the state after a step of dt, s, and its report; `state` is unchanged, even after an error."""
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
-    state, gone = start.state, None
+    state, earlier = start.state, None
     on_grid, solvers = start.on_grid, start.matrices.solvers
     flights, found = [flight_of(start)], []
     for placed in start.acting:
-        acting = start.begun(placed, gone)
+        acting = start.begun(placed, earlier)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         problem = both.momentum, both.storage, partial(on_grid.as_reset, state)
@@ -63,7 +63,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
-        gone = [one.flown(both.momentum.at) for one in acting.loads]
+        earlier = [one.flown(both.momentum.at) for one in acting.loads]
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers

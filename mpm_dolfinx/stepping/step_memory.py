@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The memory of the step-size rule of `simulation/step_size.py` between two steps."""
+"""Data of the step-size rule in `simulation/step_size.py` that one step passes to the next."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StepControl:
-    """Memory of a run's step sizes.
+    """Data of a run's step sizes that one step passes to the next.
 
     Parameters
     ----------
     interval : s
-        Output interval of the run, 0 without one.
+        Output interval of the run, 0 without an interval.
     small : s
         Next trial step.
     waits, kept
@@ -21,9 +21,9 @@ class StepControl:
     change : Pa
         Largest pressure change since the start of the run.
     first : Pa/s
-        See `Report`: value of the last step over its length, if the grid is reset.
+        Value of the last step in `Report` / its length, if the grid was reset.
     motion : J^(1/2)
-        Largest motion since the start of the run, see `motion_error`; None if it is not needed.
+        Largest motion since the start of the run, see `motion_error`; None if unused.
     filled
         Largest change of the water content in a step since the start of the run.
     """

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Reference solution: body-fitted, total-Lagrangian finite elements for Biot's equations at finite strain.
 
-With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
-on the reference configuration of a box, from state n:
+With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression), in the
+reference configuration of a box, from the state n at the start of a step:
 
     momentum   int [d psi/dF - alpha chi p dJ/dF] : grad v dV  =  int t . v dA + int m g . v dV
     storage    int rho [zeta(J, p) - zeta_n] q dV
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
 with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), rho = exp((p + p_n)/(2 K_w)).
-`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil kappa is
-multiplied by k_r.  The content changes by S(p) times its change at saturation, plus the change of S, see `retention`;
-saturated pores have chi = S = k_r = 1.  With pressures constant in the cells the two-point flux is kappa J |F^-T N|^2
-(p+ - p-)/h, for a distance h of the cells' centres.  It is not consistent under shear.  k_r is then its mean over the
-pressures between the two cells.  In axisymmetry F contains the circumferential stretch, and integrals are over the
-whole revolution.  Materials, retention, user-defined terms and time integration are shared with the material point
-method.  The two methods differ in discretisation only.
+`fluid_content` defines the content zeta and the mass potential pi.  Unsaturated soil has kappa k_r in place of kappa.
+Its content changes by S(p) times the change in saturated soil, plus the change of S, see `retention`.  Saturated pores
+have chi = S = k_r = 1.  If pressures are constant in the cells, the two-point flux is kappa J |F^-T N|^2 (p+ - p-)/h,
+with the distance h of the cells' centres.  This flux is not consistent under shear.  k_r is then its mean between
+the pressures of the two cells.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
+full circumference.  Materials, retention, user-defined terms and time integration are the code of the material point
+method.  The two methods differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.verification.pores import Pores
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
-CUT_DEGREE = 20  # of quadrature on a partly loaded side: the region's edge may cut facets
+CUT_DEGREE = 20  # quadrature degree on a partly loaded side: an edge of the region may cut facets
 
 
 class Space:
-    """The space W of the unknowns w = (u, p/scale), or of w = u, and functions in it.
+    """Space W of the unknowns w = (u, p/scale), or w = u, and functions in this space.
 
-    old: w at the start of the step; past: its change that the rate of a substep begins with; b, f: residual and loads;
-    same: equal to w, without a slope; u, p: displacement and pressure; p_dofs: where the pressures are; of_p: their
-    space alone.
+    old: w at the start of the step; past: change of w due to the rate of the previous substep; b, f: residual and
+    loads.  same: copy of w that is not differentiated; u, p: displacement and pressure.  p_dofs: degrees of freedom of
+    the pressures; of_p: space of the pressures alone.
     """
 
     def __init__(self, grid: Grid, wet: bool, degree: int, pressure: tuple[str, int, tuple[int, ...]]):
@@ -90,8 +90,8 @@ class Space:
 class Forms(NamedTuple):
     """Compiled residual, tangent, flux and loads, and their constants.
 
-    dt, since, t: time of the flux, since the start of the step, and at the end of the substep, s; given: functions of
-    time.
+    dt, since, t: time weight of the flux, time since the start of the step, and time at the end of the substep, s.
+    given: functions of time, each with the constant of its value.
     """
 
     residual: Any
@@ -105,7 +105,7 @@ class Forms(NamedTuple):
 
 
 class BiotFEM:
-    """A box body and its state; without fluid, the drained skeleton.
+    """Finite element model of a box and its state; without fluid, of the drained skeleton.
 
     Parameters
     ----------
@@ -114,24 +114,24 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton without state, and pore fluid.  Steps of steep retention (n > 2.5, an air entry) may not converge.
+        Skeleton without state, and pore fluid.  Time steps may not converge for steep retention (n > 2.5, air entry).
     walls
-        Sides with the components that are zero there, such as {"left": "xy"}.
+        Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
-        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides, nodal pressures on whole facets of a region; other
-        sides are free and sealed.
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides; nodal pressures on whole facets within a region.
+        Other sides are free and sealed.
     pressure : Pa
         Initial pore pressure, or a function of positions x (m, d), m.  The initial effective stress is zero: loads or
         strains must balance the pressure.
     gravity : callable t -> (d,), m/s^2
-        Acceleration of gravity.
+        Acceleration of gravity as a function of time.
     terms
-        User-defined terms as for `Simulation`, without terms on sides: see `user_functions`, `Source`.
-        q is a test function of the pressure's elements.
+        User-defined terms as for `Simulation`, but not on sides: see `user_functions`, `Source`.
+        q is a test function of the elements for pressure.
     element
-        "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
+        "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells, with two-point fluxes.
     numerics
-        Method of time integration, and tolerance of the residual, relative to the loads or to the residual at the start
+        Method of time integration, and tolerance of the residual relative to the loads, or to the residual at the start
         of a step.
     axisymmetric
         As for `Grid`.
@@ -167,26 +167,26 @@ class BiotFEM:
         functions("terms", terms)
         functions("sources", sources)
         if fluid is None and (drained or sources):
-            raise ValueError("drained sides and sources need a fluid")
+            raise ValueError("conditions: drained sides or sources without fluid, must be given with fluid")
         if any(outlet.seepage for outlet in drained):
             raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
         fields = (material.porosity, material.biot, material.grain_bulk)
         if material.state or material.unknowns or any(map(callable, fields)):
             raise ValueError(
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
-                "conductivity and parameters of the law may be functions of place, the rest must be numbers"
+                "conductivity and parameters of the law may be functions of position, others must be numbers"
             )
         self.grid = Grid(lower, upper, cells, axisymmetric=axisymmetric)
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
-        self._around = TURN * radius if axisymmetric else 1.0  # factor of measures in the plane
+        self._around = TURN * radius if axisymmetric else 1.0  # factor from plane to volume integrals
         self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
-        """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
+        """Unit of the unknown pressure, Pa; both equations are divided by this unit."""
         self._pores = Pores(self.grid.mesh, material.retention if fluid else None, self.scale)
         self._whole = fem.Constant(self.grid.mesh, 1.0)
-        """Share of the slope of k_r that the tangent has."""
+        """Factor of the derivative of k_r in the tangent, 0 or 1."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
         if fluid is not None:
             start = fem.Function(self._space.of_p)
@@ -206,7 +206,7 @@ class BiotFEM:
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
-        self.jit = time.perf_counter() - start  # s, compiling or finding the forms
+        self.jit = time.perf_counter() - start  # s, to compile or load the forms
         self._snes = self._solver()
 
     @property
@@ -216,16 +216,16 @@ class BiotFEM:
 
     @property
     def _places(self):
-        """True places at rest as UFL."""
+        """True reference positions as UFL."""
         return ufl.SpatialCoordinate(self.grid.mesh) + self._constant(self.grid.base)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
 
     def _field(self, value: Field) -> fem.Constant | fem.Function:
-        """Return a parameter as UFL, one that is a function of place as its quadratic interpolant in the cells.
+        """Return a parameter as UFL; a function of position is interpolated quadratically in each cell.
 
-        Its nodes are taken a little inside of their cells, so that it may jump from one to the next.
+        The interpolation points are slightly inside the cells, so that the parameter may jump between cells.
         """
         if not callable(value):
             return self._constant(value)
@@ -241,18 +241,18 @@ class BiotFEM:
         return f
 
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of a flat box around a side, or around the part of it in a region."""
+        """Return the corners of a flat box around a side, or around the part of a side in a region."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
         low, high = limits(region, grid.dim) - grid.base
         plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
         low, high = np.maximum(low, grid.low) - near, np.minimum(high, grid.high) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
-            raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
+            raise ValueError(f"side {name!r}: the region {line(region)} must contain a part of it")
         low[axis], high[axis] = plane - near[axis], plane + near[axis]
         return low, high
 
     def _prescribe(self, space, value: float, name: str, region: Region | None = None):
-        """Return the condition that a scalar subspace has a value on the facets of a side that lie in a region."""
+        """Return the boundary condition with a value for a scalar subspace, on facets of a side within a region."""
         msh = self.grid.mesh
         d = self.grid.dim
         (low, high) = np.array(self._box(name, region))[:, :, None]
@@ -260,7 +260,7 @@ class BiotFEM:
         return fem.dirichletbc(PETSc.ScalarType(value), fem.locate_dofs_topological(space, d - 1, facets), space)
 
     def _conditions(self, walls: Mapping[str, str], drained: Sequence[Drained]) -> list:
-        """Return the conditions of zero displacement and of nodal pressure."""
+        """Return the boundary conditions of zero displacement and of nodal pressure."""
         axes = "xyz"[: self.grid.dim]
         bcs = []
         space = self._space.u.function_space
@@ -271,12 +271,12 @@ class BiotFEM:
         return bcs + [self._prescribe(self._space.W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
 
     def _inward(self, name: str) -> NDArray[np.float64]:
-        """Return the direction (d,) that a side looks away from."""
+        """Return the inward normal (d,) of a side."""
         axis, end = side(name, self.grid.dim)
         return (1 - 2 * end) * np.eye(self.grid.dim)[axis]
 
     def _area(self, condition: RigidPlate) -> float:
-        """Return the area of the part of a side that a condition names (m^(d-1))."""
+        """Return the area of the part of a side on which a condition acts, m^(d-1)."""
         low, high = self._box(condition.side, condition.region)
         within = np.minimum(high, self.grid.high) - np.maximum(low, self.grid.low)
         area = float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
@@ -284,7 +284,7 @@ class BiotFEM:
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
-        """Return the integral over the part of a side that a condition names, as UFL."""
+        """Return the integral over the part of a side on which a condition acts, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
@@ -294,7 +294,7 @@ class BiotFEM:
     def _compile(
         self, loads: Sequence, outlets: Sequence | None, gravity: Callable | None, terms: Sequence, sources: Sequence
     ) -> Forms:
-        """Compile loads, residual and tangent; with `outlets` the pressure is constant in the cells."""
+        """Compile loads, residual and tangent; with `outlets` (drained sides) pressures are constant in the cells."""
         dt, since, t = (self._constant(1.0) for _ in range(3))
         law = self.material
         space = self._space
@@ -353,7 +353,7 @@ class BiotFEM:
         return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
 
     def _grad(self, f):
-        """Return grad f, of a vector in axisymmetry (3, 3)."""
+        """Return grad f as UFL; for a vector in axisymmetry (3, 3)."""
         grad = ufl.grad(f)
         if not (self.grid.axisymmetric and f.ufl_shape):
             return grad
@@ -366,23 +366,23 @@ class BiotFEM:
         return block(F) if self.grid.axisymmetric else F
 
     def _in_plane(self, T):
-        """Return the components of a tensor along the axes of the grid."""
+        """Return the components of a tensor in the axes of the grid."""
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures at the start (n,), Pa, at places (3, n), m, of the mesh."""
+        """Return the initial pressures (n,), Pa, at positions x (3, n), m, of the mesh."""
         n, places = x.shape[1], x[: self.grid.dim].T + self.grid.base
         values = pressure(places) if callable(pressure) else pressure
         return np.broadcast_to(numbers("pressure", values, (), (n,), allowed="a number, or one for each place"), n)
 
     def _held(self, J, p):
-        """Return the volume of the fluid in the pores, per volume of the reference, as UFL."""
+        """Return the volume of the pore fluid per reference volume, as UFL."""
         return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
-        """Return the change of the content, weighted by q, and the flux in a time dt, s, as UFL; pull: of gravity."""
+        """Return the change of content, times q, and the flux in a time dt, s, as UFL; pull: gravity, m/s^2."""
         law, J = self.material, ufl.det(F)
-        # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
+        # S is linear in the porosity; S_0 and S_1 are finite for infinite bulk moduli
         S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
         n, n_n = (1 - self._constant(1 - law.porosity) / volume for volume in (J, J_n))
         a, S = self._constant(S_1), self._constant(S_0) + self._constant(S_1 - S_0) * n_n
@@ -414,12 +414,12 @@ class BiotFEM:
 
     @property
     def _seen(self):
-        """Pressure, over `scale`, by which soil conducts, as UFL: with its slope or without, see `_restrained`."""
+        """Pressure / `scale` that determines k_r, as UFL: with its derivative in the tangent, or without."""
         now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
         return self._whole * now + (1 - self._whole) * same
 
     def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
-        """Return the two-point flux between cells and to drained sides, half a cell away, as UFL; weight: of fluid."""
+        """Return the two-point flux between cells and to drained sides as UFL; weight: unit weight of the fluid."""
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
@@ -446,7 +446,7 @@ class BiotFEM:
     def _solver(self) -> PETSc.SNES:
         """Return Newton's method with full steps and a direct solver.
 
-        A line search on the residual crawls where a slender body turns: rotations stretch at first order.
+        A line search is very slow where a slender body rotates: rotations cause a spurious stretch at first order.
         """
         options, prefix = PETSc.Options(), "mpm_reference_"
         if not options.hasName(f"{prefix}snes_linesearch_type"):
@@ -466,7 +466,7 @@ class BiotFEM:
         self._take(x)
         b = self._assemble(self._space.b, self._forms.residual)
         b.axpy(-1.0, _compat.petsc_vec(self._space.f))
-        # no lifting: every iterate has the prescribed values
+        # no lifting: every iterate satisfies the prescribed values
         petsc.set_bc(b, self._bcs, _compat.petsc_vec(self._space.w), -1.0)
         b.copy(out)
 
@@ -489,7 +489,7 @@ class BiotFEM:
         return _compat.petsc_vec(out)
 
     def step(self, dt: float) -> tuple[int, float]:
-        """Advance by dt (s, > 0); return Newton iterations, relative residual.  `NotConverged` keeps the state."""
+        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` keeps the state."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         newton, worst = 0, 0.0
         for substep in self._substeps:
@@ -505,13 +505,13 @@ class BiotFEM:
         return numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
-        """Solve for the end of a substep of a step dt, s; return Newton iterations, relative residual."""
+        """Solve one substep of a step of length dt, s; return the number of Newton iterations and the residual."""
         forms = self._forms
         space = self._space
         snes = self._snes
         space.past.x.array[:] = substep.before / substep.own * (space.w.x.array - space.old.x.array)
         space.f.x.array[:] = 0.0
-        if substep.before and forms.flux is not None:  # by the rate at the end of the substep before
+        if substep.before and forms.flux is not None:  # flux by the rate at the end of the previous substep
             forms.dt.value = substep.before * dt
             self._assemble(space.f, forms.flux).scale(-1.0)
         forms.dt.value = substep.own * dt
@@ -537,15 +537,15 @@ class BiotFEM:
         return len(norms) - 1, norms[-1] / scale
 
     def _free(self, x: PETSc.Vec) -> tuple[NDArray[np.float64], int]:
-        """Solve by SNES; return the norms of the residuals, and the reason of its end."""
+        """Solve by SNES; return the norms of the residuals, and PETSc's reason for the end."""
         self._snes.solve(None, x)
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
-        """Solve like `_free`, by single steps with limited pressure changes: see `retention.restrained`.
+        """Solve by single Newton steps with limited pressure changes, see `retention.restrained`; return as `_free`.
 
-        At first the tangent omits the slope of k_r (Celia, Bouloutas and Zarba 1990), also after a limited step and
-        after a rise of the residual.  With gravity and dry soil this slope can reverse the direction of the step.
+        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990), as do tangents after a limited
+        step and after an increase of the residual.  With gravity and dry soil this derivative can reverse the step.
         """
         snes, of_p = self._snes, self._space.p_dofs
         of_p = of_p[of_p < x.getLocalSize()]
@@ -570,13 +570,13 @@ class BiotFEM:
         return [*norms, last], reason
 
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
-        """Return the components (d,), Pa, of a traction at time t, s, or a pressure."""
+        """Return the components (d,), Pa, of a traction at time t, s, or the value of a pressure, Pa."""
         if isinstance(load, Pressure):
             return float(load.at(t))
         value = load.at(t, self.grid.dim)
         if not value.ndim:
             raise ValueError(
-                f"{line(load)}: value must have {self.grid.dim} components, the reference knows no normals"
+                f"{line(load)}: value must have {self.grid.dim} components, because the reference has no normals"
             )
         return value
 
@@ -589,14 +589,14 @@ class BiotFEM:
         return tuple(np.sqrt(self.grid.comm.allreduce(np.array([squares.sum() - storage, storage]))))
 
     def run(self, t_end: float, dt: float, *, probes: ArrayLike, progress: bool = False) -> Result:
-        """Advance to t_end (s) in equal steps dt (s); `GaveUp` has the histories up to the last good step.
+        """Advance to t_end, s, in equal steps dt, s; `GaveUp` has the histories up to the last good step.
 
         Parameters
         ----------
         probes : (m, d), m
-            Reference positions in the body at which the displacement is recorded.
+            Reference positions in the body at which displacements are recorded.
         progress
-            Show a progress bar on a terminal.
+            Whether to show a progress bar on a terminal.
         """
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
         if steps < 1 or abs(steps * dt - (t_end - self.t)) > NEAR * dt:
@@ -625,14 +625,14 @@ class BiotFEM:
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
-        """Return the volume of the fluid in the pores, m^d, as at zero pressure, over all processes."""
+        """Return the volume of the pore fluid at zero pressure, m^d, of all processes."""
         u, p = ufl.split(self._space.w)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
         held = _compat.compiled(self._around * self._held(ufl.det(self._deformation(u)), p) * dx)
         return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-        """Return a function's values (m, size) at reference positions x (m, d) in the body, on every process."""
+        """Return the values (m, size) of a function at reference positions x (m, d) in the body, on every process."""
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base
@@ -643,7 +643,7 @@ class BiotFEM:
         return grid.comm.allreduce(out)
 
     def _row(self, x: NDArray[np.float64]) -> Row:
-        """Return the entries of the histories for the present state."""
+        """Return the results at the present time, as one row of the histories."""
         pressure = np.zeros(0)
         if self.fluid:
             p, comm = self.scale * self._space.w.x.array[self._space.p_dofs], self.grid.comm

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Expansion of cylindrical cavities in soil at finite strain, in one dimension: a reference for laws and scenes.
 
-The initial radius is 1, with equal pressures inside and outside.
+The initial radius of the cavity is 1, with equal pressures at the cavity wall and at the outer radius.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mpm_dolfinx.materials.evaluate import LawAtPoints
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 State = dict[str, NDArray[np.float64]]
-CLOSE, MOST = 1e-10, 60  # relative residual; iterations
+CLOSE, MOST = 1e-10, 60  # relative residual; Newton iterations
 
 
 class _Rings:
-    """A law at rings; stretches (n, 2) are radial and along the ring, states name -> (n, ...), `start` is the first."""
+    """A law at n rings; stretches (n, 2): radial and hoop; state: name -> (n, ...); `start`: initial state."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -43,7 +43,7 @@ class _Rings:
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
 
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
-        """Return the normal Kirchhoff stresses (n, 2), Pa; repeat: how often all rings are in the stretches."""
+        """Return the normal Kirchhoff stresses (n, 2), Pa; repeat: number of copies of all rings in the stretches."""
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
@@ -55,16 +55,16 @@ class _Rings:
         return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / SAME
 
     def updated(self, stretches: NDArray[np.float64], state: State) -> State:
-        """Return the state at the end of a step."""
+        """Return the state at the end of a step with these stretches."""
         return state | dict(self._law.new_state(self._data(stretches, state), 0.0))
 
 
 @dataclass(frozen=True)
 class Cavity:
-    """A ring of soil in plane strain, with linear elements of one point each, under inner and outer pressure.
+    """A thick cylinder of soil in plane strain, with linear elements of one point each, under two pressures.
 
-    rings: the law; R, r: radii of the nodes at the start and now, m; state: state of the law; far: outer pressure, Pa;
-    pressure: pressure in the hole, Pa.
+    rings: law; R, r: initial and present radii of the nodes, m; state: state of the law.
+    far: pressure at the outer radius, Pa; pressure: pressure at the cavity wall, Pa.
     """
 
     rings: _Rings
@@ -75,9 +75,9 @@ class Cavity:
     pressure: float
 
     def widened(self, radius: float) -> Cavity:
-        """Return the ring after a drained expansion of its hole to a radius in one step."""
+        """Return the cylinder after drained expansion of the cavity to a radius, m, in one step."""
         n, r = len(self.R), self.r.copy()
-        r += (radius - r[0]) * r[0] / r  # as if incompressible
+        r += (radius - r[0]) * r[0] / r  # as in incompressible soil
         r[0] = radius
         middle, h = (self.R[1:] + self.R[:-1]) / 2, np.diff(self.R)
         weight = middle * h
@@ -106,24 +106,24 @@ class Cavity:
             while np.any(np.diff(r - length * step) <= 0):
                 length /= 2
             r = r - length * step
-        raise RuntimeError(f"no equilibrium at a radius of {radius:g}")
+        raise RuntimeError(f"cavity: no equilibrium at a radius of {radius:g}")
 
 
 def cavity(
     material: Skeleton, outer: float, elements: int = 300, state: Mapping[str, ArrayLike] | None = None
 ) -> Cavity:
-    """Return a cavity at the start.
+    """Return a cavity in its initial state.
 
     Parameters
     ----------
     material
         The soil.
     outer
-        Outer radius over the radius of the hole; at least a hundred for infinite soil.
+        Outer radius / radius of the cavity; at least 100 for infinite soil.
     elements
-        Number of elements, in geometric progression.
+        Number of elements; their sizes form a geometric progression.
     state
-        Initial state of the law; by default at rest.
+        Initial state variables of the law; by default those of the material.
     """
     R, rings = np.geomspace(1, outer, elements + 1), _Rings(material, elements, state)
     far = -float(rings.kirchhoff(np.ones((elements, 2)), rings.start)[-1, 0])
@@ -131,10 +131,10 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return the difference of total pressures over a ring, and the effective radial stress at its wall, Pa.
+    """Return the total radial stress, outer radius minus wall, and the effective radial stress at the wall, Pa.
 
-    Each element is independent: its radius follows from the constant volume, r^2 - a^2 = R^2 - 1.  radii: successive
-    radii of the hole, in small steps.
+    The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii:
+    successive radii a of the cavity, in small steps.
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)

@@ -32,21 +32,21 @@ KINDS = (
     *WETTING,
 )
 AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
-ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # of Newton's method; relative accuracy
+ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # Newton iterations; halvings of a step; relative accuracy
 
 
 @dataclass(frozen=True)
 class ElementTest:
-    """Results of an element test, one entry a step; the first one is the start.
+    """Results of an element test, one entry for each step; the first entry is the start.
 
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.
     strain : (n,)
-        Prescribed quantity: logarithmic axial strain, compression positive; in shear F_xy; in wetting suction, Pa.
+        Prescribed quantity: logarithmic axial strain, compression positive; in shear F_xy; in wetting the suction, Pa.
     pressure : (n,), Pa
-        Excess pore pressure: zero where drained.
+        Excess pore pressure; zero in drained tests.
     state
-        Name -> values (n, ...) of the law's state.
+        Values (n, ...) of the law's state variables, by name.
     """
 
     KINDS: ClassVar = KINDS
@@ -74,7 +74,7 @@ class ElementTest:
         return -np.log(np.linalg.det(self.F))
 
     def draw(self, file: str | Path, title: str = "") -> None:
-        """Draw stress path, stress and strain, and volume or pore pressure, into a picture."""
+        """Draw stress path, stress-strain curve, and volume strain or pore pressure, to an image file."""
         from matplotlib.figure import Figure
 
         fig = Figure(figsize=(12, 3.6), layout="constrained")
@@ -102,37 +102,37 @@ def element_test(
     cell_size: float | None = None,
     suction: float = 0.0,
 ) -> ElementTest:
-    """Drive a law through a laboratory test.
+    """Compute the response of a law in a laboratory test.
 
     Parameters
     ----------
     material
-        The soil; its constants are numbers, not functions of place.
+        The soil; its constants must be numbers, not functions of position.
     test
         One of `ElementTest.KINDS`: "isotropic", "oedometer" (no lateral strain), "triaxial drained" (constant lateral
-        stress), "triaxial undrained" (constant volume and lateral total stress), "shear drained" (simple, at constant
-        normal stress, F_xx = F_zz = 1), "shear undrained" (simple, at constant volume), "wetting isotropic" and
-        "wetting oedometer" (constant net stresses, along all axes or axial, without lateral strain).
+        stress), "triaxial undrained" (constant volume and lateral total stress), "shear drained" (simple shear at
+        constant normal stress, F_xx = F_zz = 1), "shear undrained" (simple shear at constant volume), "wetting
+        isotropic" (constant net stresses), "wetting oedometer" (constant axial net stress, no lateral strain).
     strain
-        Final value, or successive turning points: logarithmic axial strain, compression positive, in an isotropic test
-        of each axis; in shear F_xy; in wetting suctions, Pa, >= 0.
+        Final value, or successive turning points: logarithmic axial strain, compression positive, which in an isotropic
+        test all axes have; in shear F_xy; in wetting the suction, Pa, >= 0.
     steps
-        Equal steps to each turning point.
+        Number of equal steps to each turning point.
     confinement
-        Isotropic effective stress, Pa, >= 0, applied before the test, drained and slowly; 0: the law's initial stress.
+        Isotropic effective stress before the test, Pa, >= 0, applied slowly and drained; 0: the law's initial stress.
     rate
         Strain rate, 1/s, > 0, for rate-dependent laws.
     cell_size
-        Size of the cells, m, > 0, of laws that depend on it.
+        Cell size, m, > 0, for laws that depend on it.
     suction
-        Suction at the start, Pa, >= 0, of laws that depend on it; in all tests but wetting it stays.
+        Initial suction, Pa, >= 0, for laws that depend on suction; constant in all tests except wetting.
 
     Raises
     ------
     ValueError
-        An invalid argument.
+        An argument is invalid.
     NotConverged
-        The law does not reach the stress, even in short steps.
+        The law does not reach the prescribed stress, even in short steps.
     """
     instance("material", material, Skeleton)
     if test not in KINDS:
@@ -143,7 +143,7 @@ def element_test(
     if wets:
         numbers("strain", ends, (len(ends),), allowed="suctions >= 0 Pa in wetting", test=_not_negative)
         if material.retention is None:
-            raise ValueError(f"{type(material).__name__}: retention = None, must be a law of retention in wetting")
+            raise ValueError(f"{type(material).__name__}: retention = None, must be a retention curve in wetting")
     confinement = float(numbers("confinement", confinement, allowed=">= 0 Pa and finite", test=_not_negative))
     for name, value in (("rate", rate), ("cell_size", cell_size)):
         if value is not None:
@@ -162,7 +162,7 @@ def element_test(
         out.append(point.moved(out[-1], test, start, goal))
     states = {name: np.array([s.state[name] for s in out]) for name in material.state}
     F, stress = (np.array([getattr(s, name) for s in out]) for name in ("F", "stress"))
-    # undrained: constant total stress on the cell's wall, in shear constant total normal stress
+    # undrained: the lateral total stress is constant, in shear the normal total stress
     pressure = (stress - stress[0])[:, 1, 1] * test.endswith("undrained")
     return ElementTest(F, stress, np.array([first, *path]), pressure, states)
 
@@ -173,7 +173,7 @@ def _not_negative(v) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _At:
-    """A state of the soil: F (3, 3) and effective Cauchy stress (3, 3), Pa, value of the strain, the law's state."""
+    """State of the sample: F (3, 3), effective Cauchy stress (3, 3), Pa, strain as in `ElementTest`, law's state."""
 
     F: NDArray[np.float64]
     stress: NDArray[np.float64]
@@ -198,7 +198,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return the point with several deformation gradients (m, 3, 3), and one state."""
+        """Return the form data of the point for several deformation gradients F (m, 3, 3), and one state."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
@@ -218,7 +218,7 @@ class _Point:
         return _At(np.eye(3), self._stress(np.eye(3)[None], self._rest)[0], 0.0, self._rest)
 
     def compressed(self, confinement: float) -> _At:
-        """Return the soil after loading in steps to an isotropic effective stress, Pa."""
+        """Return the sample after loading in steps to an isotropic effective stress, Pa."""
         at = self.at_rest()
         first = -np.trace(at.stress) / 3
         for share in np.linspace(0, 1, 21)[1:]:
@@ -227,7 +227,7 @@ class _Point:
         return at
 
     def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
-        """Return the soil at a new strain; failed steps are halved."""
+        """Return the sample at a new strain; steps that fail are halved."""
         parts, done = [strain], 0
         while parts:
             try:
@@ -260,7 +260,7 @@ class _Point:
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
-        """Return the soil at another suction, Pa, with constant free components of the net stress."""
+        """Return the sample at another suction, Pa, with constant net stress along the free components."""
         m = self._material
         effective, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
         goal = [start.stress[i] + before - effective for i in free]
@@ -270,14 +270,14 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the soil after dt, s; free components of F are solved for Cauchy stresses equal to the goal, Pa."""
+        """Return the sample after dt, s; the free components of F are found from prescribed Cauchy stresses, Pa."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T
         nudges = np.zeros((1 + 2 * len(free), 3, 3))
         for k, (i, j) in enumerate(free):
             nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = CENTRAL, -CENTRAL
-        near = CLOSE * np.abs(goal).max() + ROUND_OFF * self._bulk  # the second is round-off
+        near = CLOSE * np.abs(goal).max() + ROUND_OFF * self._bulk  # the second term is round-off
         for _ in range(ITERATIONS):
             found = self._stress(F + nudges, at.state, dt)[:, rows, columns]
             error = found[0] - goal
@@ -288,4 +288,4 @@ class _Point:
             slope = (found[1::2] - found[2::2]).T / (2 * CENTRAL)
             step = np.linalg.lstsq(slope, error, rcond=ROUND_OFF)[0]
             F[rows, columns] -= step
-        raise NotConverged(f"element test: no stretch is found for the prescribed stress at a strain of {strain:g}")
+        raise NotConverged(f"element test: no stretch was found for the prescribed stress at a strain of {strain:g}")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Exact solutions for comparison: consolidation, columns, beams and rods.  No dolfinx.
 
-Stress is positive in tension, pore pressure in compression, as in the rest of the package.  Times are
-reduced to T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a
-closed inverse of the Laplace transform is used, with tanh X, coth X -> 1 for X = sqrt(s).  The error of
-either is of the order of erfc(1/sqrt(T)) < 2e-23 or less: both are exact to round-off.
+Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
+T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a closed inverse of the
+Laplace transform is used, with tanh X, coth X -> 1 for X = sqrt(s).  Errors of both are of the order of
+erfc(1/sqrt(T)) < 2e-23 or less: both are exact to round-off.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from scipy.special import ellipe, ellipeinc, ellipkinc, ellipkm1, erf, erfc, erf
 
 from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME, TINY
 
-SWITCH = 0.02  # reduced time below which the form for short times is taken.  Source: both are exact
-TERMS = 20  # exponentials above it.  Source: exact bound, the last is below exp(-70)
+SWITCH = 0.02  # dimensionless time below which the closed inverse is used.  Source: both forms are exact
+TERMS = 20  # number of exponentials.  Source: exact bound, the last is below exp(-70)
 Array = NDArray[np.float64]
 
 
@@ -43,7 +43,7 @@ def _within(name: str, value: ArrayLike, upper: float) -> Array:
 
 
 def _by_time(short, long, T: ArrayLike) -> Array:
-    """Return short(T) where T < SWITCH and long(T) elsewhere; neither sees a T of the other's range."""
+    """Return short(T) where T < SWITCH, else long(T); each function is evaluated only in its own range of T."""
     T = np.asarray(T)
     return np.where(T < SWITCH, short(np.minimum(T, SWITCH)), long(np.maximum(T, SWITCH)))[()]
 
@@ -80,7 +80,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
 
 
 def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
-    """Return the degree of consolidation: settlement since t = 0+ over its final value.
+    """Return the degree of consolidation: settlement since t = 0+ / final settlement since t = 0+.
 
     Parameters as for `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
     Returns (...), in (0, 1]. Source: Terzaghi (1923); Verruijt.
@@ -93,18 +93,18 @@ def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
 
 @dataclass(frozen=True)
 class Mandel:
-    """Mandel's slab in plane strain, squeezed from t = 0 by rigid smooth plates, free and drained at its sides.
+    """Mandel's slab in plane strain, loaded from t = 0 by rigid smooth plates, free and drained at its lateral sides.
 
-    One quarter of the slab: symmetry at x = 0 and at y = 0, the plate at y = b, the drained side at x = a.
+    The model is a quarter of the slab: symmetry at x = 0 and at y = 0, the plate at y = b, the drained side at x = a.
 
     Parameters
     ----------
-    a, b : m, > 0; width and height of the quarter, half of the slab's
+    a, b : m, > 0; width and height of the quarter, half of the slab's width and height
     bulk, shear : Pa, > 0; drained moduli K and G (K of three dimensions)
     mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
     storage : 1/Pa, >= 0; S at constant strain, n/K_w + (alpha - n)/K_s
     alpha : in (0, 1]; Biot's coefficient
-    force : N/m; resultant on the plate of width a, per depth, positive in compression
+    force : N/m; resultant on the plate of width a, per metre of depth, positive in compression
 
     Source: Mandel (1953), Géotechnique 3; Cheng & Detournay (1988), Int. J. Numer. Anal. Methods Geomech. 12;
     Abousleiman et al. (1996), Géotechnique 46. Their (1 - nu)/(nu_u - nu) is written with K, G, alpha and S.
@@ -135,7 +135,7 @@ class Mandel:
 
     @property
     def nu_undrained(self) -> float:
-        """Undrained Poisson ratio, that of G and the bulk modulus K + alpha²/S; 0.5 for S = 0."""
+        """Undrained Poisson ratio, for the moduli G and K + alpha²/S; 0.5 for S = 0."""
         bulk, shear = self.bulk * self.storage + self.alpha**2, self.shear * self.storage
         return (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear)
 
@@ -146,7 +146,7 @@ class Mandel:
 
     @property
     def _ratio(self) -> float:
-        """(1 - nu)/(nu_u - nu) > 1, without the difference."""
+        """(1 - nu)/(nu_u - nu) > 1, computed without cancellation."""
         return 1 + (self.bulk / self.shear + 1 / 3) * (1 + self._oedometric * self.storage / self.alpha**2)
 
     @cached_property
@@ -159,19 +159,19 @@ class Mandel:
         return r
 
     def pressure(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pore pressure, the same at all y.
+        """Return the pore pressure, which is independent of y.
 
-        Distances from the middle x are (...), m, in [0, a], and broadcast with times t (...), s, > 0.
-        Returns (...), Pa; at t = 0+ it is B (1 + nu_u) force / (3 a). Source: see the class.
+        x (...): distances from the middle, m, in [0, a], broadcast with times t (...), s, > 0.
+        Returns (...), Pa; at t = 0+ the pressure is B (1 + nu_u) force / (3 a). Source: see the class.
         """
         return self._pressures(x, t)[0]
 
     def displacement(self, x: ArrayLike, y: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
-        """Return the displacement from the state before the force.
+        """Return the displacement relative to the state without force.
 
-        Positions x and y are (...), m, in [0, a] and [0, b]; each broadcasts with times t (...), s, > 0.
-        Returns (u_x, u_y), m; u_x does not depend on y, u_y not on x. Source: the pressure, no lateral total
-        stress, and the resultant on the plate; equal to the class's papers.
+        x, y (...): positions, m, in [0, a] and [0, b]; each broadcasts with times t (...), s, > 0.
+        Returns (u_x, u_y), m; u_x is independent of y, u_y of x. Source: computed from the pressure, zero lateral total
+        stress and the resultant on the plate; equal to the displacement in the class's papers.
         """
         x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
         plane = self.bulk + self.shear / 3  # lambda + G
@@ -181,7 +181,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, and its integral from 0 to x over a, (2, ...)."""
+        """Return the pressure, Pa, and its integral from 0 to x divided by a, Pa, (2, ...)."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
@@ -200,14 +200,14 @@ class Mandel:
 
 
 def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure at the centre of a loaded sphere that drains at its surface.
+    """Return the pore pressure at the centre of a sphere under surface load that drains at its surface.
 
     Parameters
     ----------
     t : (...), s, > 0; time
-    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3): fluid and grains are incompressible
+    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3), as fluid and grains are incompressible
     nu : in (-1, 0.5); drained Poisson ratio
-    p0 : Pa; uniform load on the surface, and the pressure at t = 0+
+    p0 : Pa; uniform pressure on the surface, equal to the pore pressure at t = 0+
 
     Returns (...), Pa. Source: Cryer (1963), Q. J. Mech. Appl. Math. 16; Verruijt.
     """
@@ -219,7 +219,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
 
 
 def _cryer_short(mu: float, T: Array) -> Array:
-    """Invert (1 - 2 X exp(-X)) / (X² - mu X + mu), whose poles in X are k and its conjugate."""
+    """Return the inverse of (1 - 2 X exp(-X)) / (X² - mu X + mu), with poles at X = k and its conjugate."""
     k = (mu + 1j * np.sqrt(mu * (4 - mu))) / 2
     uniform = (k * _transient(k, 0, T)).imag / k.imag
     gauss = np.exp(-1 / (4 * T)) / np.sqrt(np.pi * T)
@@ -236,16 +236,16 @@ def _cryer_long(mu: float, T: Array) -> Array:
 
 @dataclass(frozen=True)
 class SelfWeightColumn:
-    """Column of Hencky's material, held laterally, standing at Y = 0 under its own weight.
+    """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
-    With no lateral stretch, Cauchy's and the first Piola-Kirchhoff stress along the column are both
-    tau / stretch, and carry the weight above. For nu = 0 the modulus K + 4G/3 is Young's.
+    Without lateral stretch, the Cauchy and the first Piola-Kirchhoff stress along the column are both
+    tau / stretch, and balance the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
 
     Parameters
     ----------
-    l0 : m, > 0; height without weight
+    l0 : m, > 0; height without gravity
     bulk, shear : Pa, > 0; moduli K and G of tau = (K + 4G/3) ln(stretch)
-    density : kg/m³, > 0; without weight
+    density : kg/m³, > 0; density without gravity
     gravity : m/s², > 0; downwards
 
     Source: tau / stretch = -density gravity (l0 - Y), solved with W of Corless et al. (1996), Adv. Comput. Math. 5.
@@ -273,18 +273,18 @@ class SelfWeightColumn:
         return np.exp(-self._shortening(Y))
 
     def position(self, Y: ArrayLike) -> Array:
-        """Return the heights (...), m, of points with reference Y (...), m, in [0, l0]. Source: integral of stretch."""
+        """Return the heights (...), m, for reference heights Y (...), m, in [0, l0]. Source: integral of stretch."""
         base, w = self._shortening(0.0), self._shortening(Y)
         return self.l0 * (base - w) * (1 + (base + w) / 2) / (base * np.exp(base))
 
     @property
     def height(self) -> float:
-        """The height of the column now, m."""
+        """Present height of the column, m."""
         return float(self.position(self.l0))
 
 
 def elastica_tip(load_parameter: float) -> tuple[float, float]:
-    """Return the displacement of the tip of an inextensible cantilever under a dead transverse load there.
+    """Return the tip displacement of an inextensible cantilever under a dead transverse load at its tip.
 
     The load_parameter is P L²/(E I), in [0, 1e5].
     Returns (shortening u/L, deflection v/L), to 1e-12 absolute. Source: Bisshopp & Drucker (1945), Q. Appl. Math. 3.
@@ -294,7 +294,7 @@ def elastica_tip(load_parameter: float) -> tuple[float, float]:
         return load_parameter**2 / 15, load_parameter / 3
     root = np.sqrt(load_parameter)
 
-    def angles(q):  # for a rotation of the tip whose sine is 1 - exp(-q)
+    def angles(q):  # for a rotation of the tip with the sine 1 - exp(-q)
         return np.exp(-q) / 2, np.arctan2(1, np.sqrt(-np.expm1(-q)))
 
     def excess(q):
@@ -309,16 +309,16 @@ def elastica_tip(load_parameter: float) -> tuple[float, float]:
 def shear_flexible_rod(
     length: float, EA: float, GA: float, EI: float, end_load: float = 0, line_load: float = 0, points: ArrayLike = 101
 ) -> Array:
-    """Return the deformed axis of a geometrically exact planar cantilever that stretches and shears.
+    """Return the deformed axis of a geometrically exact planar cantilever with stretch and shear.
 
-    The rod lies along x from its clamp at the origin. Loads are dead, and positive along +y.
+    The rod lies along x from its clamp at the origin. Loads are dead loads, positive along +y.
 
     Parameters
     ----------
     length : m, > 0
-    EA, GA, EI : N, N, N m² (per depth: N/m, N/m, N m), > 0, inf allowed for EA and GA; GA with its shear correction
-    end_load, line_load : N and N/m; force at the end, and per reference length
-    points : at least 2 equidistant points from end to end, or their reference arclengths (n,), m, in [0, length]
+    EA, GA, EI : N, N, N m² (per depth: N/m, N/m, N m), > 0, inf allowed for EA and GA; GA with shear correction factor
+    end_load, line_load : N and N/m; force at the end, and force per reference length
+    points : number of equidistant points from end to end, >= 2, or reference arclengths (n,), m, in [0, length]
 
     Returns (n, 2), m, by collocation with a residual of 1e-8. Source: Reissner (1972), ZAMP 23; Simo (1985), CMAME 49.
     """
@@ -332,7 +332,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Solve for (x, y, rotation, moment) of the rod of unit length and bending stiffness, in steps of the load."""
+    """Solve for (x, y, rotation, moment) of the rod with unit length and unit bending stiffness, in load steps."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 
@@ -352,10 +352,10 @@ def _rod(loads: Array, axial: float, shear: float):
 
 
 def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, second_moment: float) -> NDArray:
-    """Return the deflection (n,), m, of a cantilever under a uniform load, at distances x (n,) from the clamp, m.
+    """Return the deflection (n,), m, of a cantilever under a uniform load, at distances x (n,), m, from the clamp.
 
-    w x^2 (6 L^2 - 4 L x + x^2) / (24 E I): load w, N/m, of any sign, and with values > 0 length L, m, Young's modulus
-    E, Pa, second moment of area I, m^4.
+    The deflection is w x^2 (6 L^2 - 4 L x + x^2) / (24 E I), with load w, N/m, of any sign.  Length L, m, Young's
+    modulus E, Pa, and second moment of area I, m^4, are > 0.
     """
     x = np.asarray(x, dtype=float)
     return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)  # Source: exact

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pores of the finite element reference that drain under suction, see `retention`; pressures are over a unit."""
+"""Pores of the finite element reference that drain under suction, see `retention`; pressures are in a given unit."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mpm_dolfinx.pores.retention import GAUSS, property_of, restrained, scale_of
 
 
 class Pores:
-    """Pores of one law.
+    """Saturation and permeability of pores with one retention curve.
 
     Parameters
     ----------
     domain
         Mesh of the forms.
     law
-        The law of retention; None: pores stay full.
+        Retention curve; None: pores stay saturated.
     unit
         Unit of the pressures, Pa.
     """
@@ -31,14 +31,14 @@ class Pores:
             self._drains = fem.Constant(domain, self._scale)
 
     def of(self, name: str, p):
-        """Return a property at pressures p as UFL: see `Retentions.of`."""
+        """Return a property at pressures p as UFL; name: see `Retentions.of`."""
         return ufl.as_ufl(1.0) if self.law is None else property_of(self.law, name, self._unit * p)
 
     def between(self, p0, p1):
-        """Return the mean of k_r over the pressures between two as UFL.
+        """Return the mean of k_r between the pressures p0 and p1 as a UFL expression.
 
-        Its points of integration lie evenly on the scale of `retention.logarithm`. On the scale of the pressure all of
-        them would be dry between a wet cell and a very dry one.
+        Integration points are equidistant on the scale of `retention.logarithm`. With points on the scale of the
+        pressure, all points between a wet cell and a very dry one would be dry.
         """
         if self.law is None:
             return 1.0
@@ -57,5 +57,5 @@ class Pores:
         return mean / total
 
     def reached(self, p: NDArray[np.float64], dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much pressures p (n,) are to fall where Newton's method asks for falls dp (n,)."""
+        """Return the limited decreases of pressures p (n,) in a Newton step; dp (n,): decreases by Newton's method."""
         return restrained(p, dp, self._scale)
