@@ -8,6 +8,7 @@ are measured from the seeded positions, so errors do not accumulate.  Forces on 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import combinations, product
 
 from petsc4py import PETSc
 
@@ -20,8 +21,8 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import HOLD, Tied, holding
-from mpm_dolfinx.conditions.sides import gathered
+from mpm_dolfinx.conditions.conditions import HOLD, Drained, Inflow, Quiet, Rain, Tied, holding
+from mpm_dolfinx.conditions.sides import check_apart, gathered
 from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix, shape_values_in
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
@@ -43,7 +44,7 @@ class Tie:
         alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
         small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
         if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
-            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a box with equal faces")
+            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a body from mpm.box, with equal faces")
         self.offset = opposite[self.partner] - at
 
 
@@ -58,7 +59,7 @@ class Ties(Acting):
     Raises
     ------
     ValueError
-        The sides are not opposite, or their faces differ.
+        The sides are not opposite, or their faces differ; a side is tied twice, quiet, or open to water.
     """
 
     conditions, title = (Tied,), "tied sides"
@@ -67,6 +68,11 @@ class Ties(Acting):
         self._grid, self._materials = setting.grid, setting.materials
         of = setting.sides.of
         self._ties = [Tie(tied, of(tied), of(Tied(tied.other, tied.side))) for tied in ties.values()]
+        sides = [(tied, (tie.one, tie.other)) for tied, tie in zip(ties.values(), self._ties, strict=True)]
+        excluded = [(one, (of(one),)) for one in setting.of(Quiet, Drained, Inflow, Rain).values()]
+        for (one, faces), (other, others) in [*combinations(sides, 2), *product(sides, excluded)]:
+            for a, b in product(faces, others):
+                check_apart(one, a, other, b)
 
     @property
     def surfaces(self) -> list[Surface]:

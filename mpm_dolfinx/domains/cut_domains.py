@@ -155,10 +155,7 @@ class CutDomains(Keyed):
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
-
-        `volume` (m,) are the volumes of the pieces, m^d.
-        """
+        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of plane sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]

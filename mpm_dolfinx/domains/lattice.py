@@ -172,8 +172,8 @@ def _change(
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]
-            apart = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
-            field[sites[np.logical_or.reduce(apart.T)]] = np.nan
+            differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
+            field[sites[np.logical_or.reduce(differs.T)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # the part of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
@@ -245,10 +245,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed by a condition or fixed by a wall.
-
-    `walls` are the fixed components of each wall, by name.
-    """
+    """Return which components (n, 2^d, d) of corners a condition prescribes, or `walls` (name -> components) fix."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)

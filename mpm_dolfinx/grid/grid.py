@@ -23,7 +23,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
-from mpm_dolfinx.grid.lines import checked, equal, rounding
+from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
 from mpm_dolfinx.grid.partition import destinations, owners
 
 SIDES = {
@@ -37,8 +37,6 @@ TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
 """Number of rows that are processed together, which limits the size of temporary arrays."""
-MOST = 2**31 - 1
-"""Largest number of unknowns for PETSc's 32-bit integers."""
 SNAP = 1e-10
 """Distance to a grid plane, in cells, below which a vertex lies on the plane, unless rounding errors are larger."""
 ORDER = "the order is Grid(lower, upper, cells)"
@@ -213,7 +211,8 @@ class Grid:
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
         the tool, and the cells around them widen or narrow.  A function of time t (s) and positions x (n, d) of all
-        points (parameters t, x or both) returns the same number of lines, between the same sides.
+        points (parameters t, x or both) returns the same number of lines, between the same sides.  A tool must be a
+        condition of the first stage; lines stay in stages without it.
     axisymmetric
         The first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes, forces
         and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is

@@ -78,18 +78,14 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,).
+    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,)."""
 
-    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, m^d, the exchanged
-    fluid volume; start: forces at the start of the step, N; fluid: residual of the storage, or None.
-    """
-
-    u: NDArray[np.float64]
-    p: NDArray[np.float64]
-    forces: NDArray[np.float64]
-    exchanged: NDArray[np.float64]
-    start: NDArray[np.float64]
-    fluid: StorageResidual | None
+    u: NDArray[np.float64]  # relative residual of momentum
+    p: NDArray[np.float64]  # relative residual of storage
+    forces: NDArray[np.float64]  # scale of u, N
+    exchanged: NDArray[np.float64]  # scale of p: exchanged fluid volume, m^d
+    start: NDArray[np.float64]  # forces at the start of the step, N
+    fluid: StorageResidual | None  # residual of the storage, or None
 
     @cached_property
     def each(self) -> NDArray[np.float64]:

@@ -201,16 +201,11 @@ class Motion:
         volume, *sums = sum_by(places.slots, rows, len(places.filled))
         of_cells = np.reshape(sums, (d, 1 + d, -1)).transpose(2, 0, 1)
         x = grid.node_x[grid.cell_nodes[places.filled]]
-        whole = self._momentum.at_nodes(places.filled, volume)[:, None]
         moved = of_cells[:, None, :, 0] + x @ of_cells[:, :, 1:].swapaxes(1, 2)
-        dofs, at = places.dofs
-
-        def add(out: NDArray[np.float64]) -> None:
-            out[dofs] += sum_by(at, moved.ravel(), len(dofs))
-
-        total, nodes = self._momentum.summed(0, [add]), self._momentum.active.now.nodes
-        out = np.zeros((len(total) // d, d))
-        out[nodes] = total.reshape(-1, d)[nodes] / np.where(whole > 0, whole, 1.0)
+        total, nodes = partial(self._momentum.at_nodes, places.filled), self._momentum.active.now.nodes
+        whole, out = total(volume), np.zeros((len(grid.node_x), d))
+        for axis in range(d):
+            out[nodes, axis] = total(moved[:, :, axis]) / np.where(whole > 0, whole, 1.0)
         return out.ravel()
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
