@@ -29,7 +29,7 @@ from mpm_dolfinx.parallel.exchange import to_root
 SOFT = 0.1
 """Weight of the motion.  Alternating volumes of a regular lattice do not change with its corners, to first order.
 
-Plateau (flow): halved 1.3e-04, doubled 3.2e-04, cells 9.2e-02 (relative changes of the result).
+Sensitivity (flow scene): half the value changes the result by 1.3e-04, twice by 3.2e-04, finer cells by 9.2e-02.
 """
 
 
