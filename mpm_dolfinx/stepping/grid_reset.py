@@ -408,7 +408,7 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) keep their pieces, as their connected part, or any of the groups, hardly moves."""
+        """Return which points (n,) keep their pieces: their connected part, or with groups all bodies, hardly move."""
         all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
         part, count = (0, 1) if all_of_them or self.cut.grid.copies > 1 else self.parts
         if count == 1:
@@ -563,7 +563,7 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function of (whether a step begins) that returns the fluxes at u.
+        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u; begins: of a step.
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 
