@@ -124,8 +124,7 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of a box; exact: displacement of the top, m; width: in cells, -1: equal to the
-    height.
+    """Yield (method, setting, run) of a box; exact: displacement of its top, m; width: cells, -1: as the height.
 
     time: end (s) and number of steps of the sweep over the cells; steps: numbers of steps of the sweep over time.
     """

@@ -77,8 +77,7 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma H / c (n,), and the crest's settlement per step, divided by that in the first five steps
-    (n,).
+    """Stability numbers gamma H / c (n,), and settlements per step, divided by that in the first five steps (n,).
 
     critical: the number at which the bank fails.
     """
