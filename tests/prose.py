@@ -72,7 +72,8 @@ def messages(tree: ast.AST) -> list[tuple[int, str]]:
             if isinstance(each, ast.JoinedStr):
                 parts.update(ast.walk(each))
                 text = [
-                    str(v.value) if isinstance(v, ast.Constant) else f"`{ast.unparse(v.value)}`" for v in each.values
+                    v.value.replace("`", "") if isinstance(v, ast.Constant) else f"`{ast.unparse(v.value)}`"
+                    for v in each.values
                 ]
                 out.append((each.lineno, "".join(text)))
             elif isinstance(each, ast.Constant) and isinstance(each.value, str):

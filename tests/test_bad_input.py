@@ -297,6 +297,23 @@ CASES = {
     "elements with a state": (lambda: fem(material=sand()), "DruckerPrager", "no state"),
     "elements fixed at an unknown side": (lambda: fem(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
     "elements fixed by an unknown component": (lambda: fem(walls={"left": "q"}), "walls: 'left'", "'q'"),
+    "rain without fluid": (lambda: sides("Rain", "top", 1e-6), "rain_top: Rain(side='top'", "fluid"),
+    "rain on two sides": (lambda: mpm.Rain(["top", "left"], 1e-6), "Rain: side", "['top', 'left']"),
+    "retention without fluid": (
+        lambda: scene(materials=[soil(retention=mpm.Gardner(1e-3))]),
+        "Hencky: retention",
+        "Gardner",
+    ),
+    "graded lines without end": (
+        lambda: mpm.graded([0, 0], [4, 4], [[[0, 0], [1, 1]]], 1e-8),
+        "graded: size = 1e-08",
+        "1e+16 cells",
+    ),
+    "tool with a moment but no mass": (
+        lambda: mpm.Tool(mpm.Ball((0, 0), 1.0), moment=2.0),
+        "Tool: moment",
+        "2.0",
+    ),
     "elements drained without fluid": (lambda: fem(conditions=[mpm.Drained("top")]), "drained", "fluid"),
     "elements loaded nowhere": (
         lambda: fem(conditions=[mpm.Traction("top", (0, 1), region=((2, 0), (3, 1)))]),

@@ -132,7 +132,14 @@ def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_l
     )
     assert loads == pytest.approx(loads.mean(), rel=0.06)
     assert loads[..., 1] == pytest.approx(loads[..., 0], rel=0.025)
-    assert loads[..., 2] == pytest.approx(loads[..., 1], rel=0.04)  # the largest where it rests on a grid line
+    assert loads[..., 2] == pytest.approx(loads[..., 1], rel=0.01)
+
+
+def test_a_side_that_has_come_to_a_grid_line_rests_there():
+    """By 0.02 of a cell it was in nearly empty cells, and its force grew by 8 % while it was held."""
+    loads = np.array(pushed_along_a_rough_base(0.8, 5, 0.52))
+    print(f"at once, held for one step, for ten {loads}")
+    assert loads == pytest.approx(loads[0], rel=0.01)
 
 
 def test_a_side_one_cell_high_on_a_rough_base_is_held_too():

@@ -248,6 +248,7 @@ def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
         ({"gravity": (1.0, -9.81)}, r"K0 with gravity = \[1.0, -9.81\], must point down"),
         ({"pressure": lambda x: np.nan}, r"pressure\(x\) = nan, must be a finite number, or one for each"),
         ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "must be inside the yield surface of MohrCoulomb"),
+        ({"law": "mohr-coulomb", "initial_stress": mpm.K0(5.0)}, r"principal stresses .* degrees allows K0 from .* to"),
         ({"law": "mohr-coulomb", "level": 6.0}, "K0 needs the weight of open water as surcharge"),
         ({"law": "cam clay", "initial_stress": lambda x: np.tile([0, 1e4, 0], (len(x), 1))}, "a compressive mean"),
     ],

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from scenes.balancing import ROUNDED, Ledger, balanced, held_by_conditions
 from scenes.comparing import differences, resolved
-from scenes.description import Block, Condition, RigidTool, Scene, draining, drawn
+from scenes.description import Block, Condition, RigidTool, Scene, draining, drawn, newer
 from scenes.frames import Frame, composite
 from scenes.running import counted, run
 
@@ -167,10 +167,22 @@ def test_scenes_whose_pores_drain_show_the_same_in_any_frame(seeds):
     assert not count["differs"] and count["same"], count
 
 
+@pytest.mark.parametrize("seeds", [(3, 6), pytest.param(range(62), marks=pytest.mark.slow)], ids=["few", "many"])
+def test_scenes_with_inertia_ties_and_free_tools_show_the_same_in_any_frame(seeds):
+    """INVARIANCE_SEEDS=1000:2000 says which many."""
+    if len(seeds) > 2 and "INVARIANCE_SEEDS" in os.environ:
+        seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
+    count = reported(newer(seed, laws=LAWS[0 if len(seeds) == 2 else seed % 3]) for seed in seeds)
+    assert not count["differs"] and count["same"], count
+
+
 @pytest.mark.skipif("INVARIANCE_SEED" not in os.environ, reason="asks for a seed")
 def test_a_scene_is_reproduced():
+    """INVARIANCE_DRAW=newer (or draining) says by which function."""
     seed = int(os.environ["INVARIANCE_SEED"])
     scene = quick(seed) if seed < QUICK else drawn(seed)
+    if draw := os.environ.get("INVARIANCE_DRAW"):
+        scene = {"newer": newer, "draining": draining}[draw](seed, laws=LAWS[seed % 3])
     frame = composite(scene, 0)
     outcome = tried(scene, frame)
     print("\n" + repr(scene), "\n" + line(scene, frame, outcome))
@@ -258,7 +270,7 @@ def ledgers(scenes) -> list[tuple[Scene, Ledger]]:
     for scene in scenes:
         ledger = Ledger()
         try:
-            counted(scene, ledger)
+            counted(scene, ledger, ledger.begun)
         except (ValueError, mpm.NotConverged, mpm.LeftGrid):
             continue
         tell(f"forces off by {ledger.off:.1e}, fluid by {ledger.leaked:.1e}: {scene.line()}")
@@ -298,5 +310,5 @@ def test_soil_that_hardly_changes_its_volume_weighs_what_it_does():
     press = Condition("displacement", "top", (0.0, -0.087), 640.0, "xy")
     scene = Scene(0, (7, 7), (0.32, 0.58), False, (block,), (law,), {}, (press, base), gravity=9.81, end=2100.0)
     ledger = Ledger()
-    counted(scene, ledger)
+    counted(scene, ledger, ledger.begun)
     assert ledger.off < 1e-10, ledger.said

@@ -159,10 +159,10 @@ LINES = [[0, 1, 1.5, 2, 3], [0, 1, 1.5, 2, 3]]
 BALL = mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0, -t))
 
 
-def step(follow, lines=LINES):
-    """Make a step, at t = 1 s, on lines that follow."""
+def step(follow, lines=LINES, there=True):
+    """Make a step, at t = 1 s, on lines that follow; a tool may be there or not."""
     grid = mpm.Grid(lines=lines, follow=follow)
-    tool = [follow] if isinstance(follow, mpm.Tool) else []
+    tool = [follow] if isinstance(follow, mpm.Tool) and there else []
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=tool)
     s.t = 1.0
     s.step(0.1)
@@ -180,6 +180,7 @@ def step(follow, lines=LINES):
         (lambda: step(lambda t: [[0, 2, 1, 2.5, 3], LINES[1]]), "lines along x", "[0, 2, 1, 2.5, 3]"),
         (lambda: step(lambda t: 1 / 0), "grid: follow at t = 1 s", "ZeroDivisionError"),
         (lambda: step(BALL), "grid: follow", "0 m from a side"),
+        (lambda: step(BALL, there=False), "grid: follow", "not in the first stage"),
         (lambda: step(BALL, [LINES[0], [0, 0.5, 1, 2, 3]]), "grid: follow", "begin at a side"),
     ],
 )

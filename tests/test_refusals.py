@@ -195,7 +195,7 @@ CASES = {
     "an excavation of a body": (lambda: two().stage(remove=[UPPER]), "stage: remove", "each once: 0, 1"),
     "a fill that comes twice": (lambda: two(later=[1]).stage(add=[1, 1]), "stage: add: body 1", "each once: 1"),
     "reset in words": (lambda: two().stage(reset_displacement="no"), "reset_displacement", "'no'"),
-    "sides in a list": (lambda: sides("Traction", ["top", "left"], 1.0), "side ['top', 'left']", "left, right"),
+    "sides in a list": (lambda: sides("Traction", ["top", "left"], 1.0), "Traction: side = ", "['top', 'left']"),
     # ---- conditions that contradict each other
     "drained twice": (
         lambda: wet(conditions=[mpm.Drained("top"), mpm.Drained("top", 1e5, region=((0, 0), (0.3, 1)))]),

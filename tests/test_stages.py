@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers import column, top_load
 
 import mpm_dolfinx as mpm
 
@@ -125,7 +126,7 @@ def test_walls_plates_and_given_displacements_come_and_go():
     [
         ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
         ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are still to be added, each once"),
-        ({"conditions": [mpm.Drained("top")]}, "without fluid, must be in a scene with fluid"),
+        ({"conditions": [mpm.Drained("top")]}, "must be in a scene with fluid"),
         ({"gravity": (0, -1)}, "gravity: the scene has none"),
     ],
 )
@@ -166,3 +167,10 @@ def test_a_mapped_body_has_no_face_where_a_region_is():
     assert s.run(1.0, 1.0, progress=False).converged
     with pytest.raises(ValueError, match="no point has this side in the region"):
         s.stage(conditions=[mpm.Traction("top", -1e3, region=((0.8, 0), (1, 2)))])
+
+
+def test_an_unknown_result_is_refused_and_a_known_one_without_a_condition_is_empty():
+    s = column(fluid=False, conditions=[top_load()])
+    assert s.outcome("runoff") == {}
+    with pytest.raises(KeyError, match=r"outcome: quantity = 'run-off', must be one of reactions, .*, runoff, "):
+        s.outcome("run-off")

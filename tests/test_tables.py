@@ -99,8 +99,11 @@ def test_a_plot_has_the_stress_of_dry_soil_and_the_saturation_of_unsaturated_soi
     height = wet.points.x[:, 1]
     assert np.all(drawn.get_array()[height < 1] == 1)
     assert np.all(np.diff(drawn.get_array()[np.argsort(height)][height[np.argsort(height)] > 1][::2]) < 0)
-    with pytest.raises(ValueError, match="plot: field = 'saturation', must be one of"):
+    (drawn,) = mpm.plot(wet, "suction").collections
+    assert np.array_equal(drawn.get_array(), np.maximum(-wet.points.pressure, 0))
+    with pytest.raises(ValueError, match="plot: field = 'saturation', must be one of") as caught:
         mpm.plot(beam(h=0.1)[0], "saturation")
+    assert "softness" not in str(caught.value) and "suction" not in str(caught.value)
     matplotlib.pyplot.close("all")
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Waves leave through quiet sides, which keep their tractions at rest; bases move as prescribed."""
 
+import warnings
 import wave
 
 import numpy as np
@@ -233,11 +234,51 @@ def test_a_resumed_wave_has_the_same_bits(tmp_path):
         ([mpm.Quiet("bottom", incoming=(1, 2, 3))], {}, "incoming"),
         ([mpm.Quiet("bottom")], {"initial_stress": mpm.K0(0.5), "gravity": (0, -9.81)}, "initial stress"),
         ([mpm.Quiet("middle")], {}, "middle"),
+        ([mpm.Quiet("bottom"), mpm.Displacement("bottom", (0, 0))], {}, "both act"),
+        ([mpm.Quiet("top")], {"top": True}, "the wall 'top' of the grid fixes the side"),
+        ([mpm.Quiet("bottom")], {"gravity": (0, -9.81)}, "does not bear the weight"),
     ],
 )
 def test_what_is_no_quiet_side_is_refused(conditions, options, names):
     with pytest.raises(ValueError, match=names):
+        if options.pop("top", False):  # a body below a wall, which fixes its side
+            grid = mpm.Grid([0, 0], [1, 2], [1, 2])
+            body = mpm.box(grid, [0, 1], [1, 2])
+            mpm.Simulation(grid, [body], [SOIL], walls={"top": "xy"}, conditions=conditions, inertia=True)
         column(4, conditions, **options)
+
+
+def test_a_side_may_be_quiet_along_what_is_free():
+    rollers, walls = mpm.Displacement("bottom", (0, 0), "y"), {"left": "x"}
+    column(4, [mpm.Quiet("bottom"), rollers], walls).step(0.01)
+
+
+def test_a_quiet_side_does_not_bear_a_weight_that_changes():
+    s = column(4, [mpm.Displacement("bottom", (0, 0), "y")], gravity=(0, -9.81), inertia=False)
+    s.run(1.0, 1.0, progress=False)
+    with pytest.raises(ValueError, match=r"gravity = \[0.0, -5.0\] after \[0.0, -9.81\]"):
+        s.stage(inertia=True, gravity=(0, -5), conditions=[mpm.Quiet("bottom")])
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_a_stage_with_inertia_warns_of_sides_that_a_displacement_moves_at_once(resets):
+    """Sides that were free in the static stage have settled; their displacement counts from the start."""
+    sides, base = (
+        [mpm.Displacement(side, (0, 0), "y") for side in ("left", "right")],
+        mpm.Displacement("bottom", (0, 0)),
+    )
+    h = HEIGHT / 6
+    grid = mpm.Grid([0, 0], [3 * h, HEIGHT + 3 * h], [3, 9])
+    body = mpm.box(grid, [0.5 * h, 1.37 * h], [2.5 * h, HEIGHT + 1.37 * h])
+    scene = {"walls": {}, "conditions": [base], "gravity": (0, -9.81), "inertia": False}
+    s = mpm.Simulation(grid, [body], [SOIL], **scene)
+    s.run(1.0, 1.0, progress=False)
+    s.stage(inertia=True, conditions=[base, *sides], reset_displacement=resets)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        s.run(1.02, 0.01, progress=False)
+    jumps = [str(one.message) for one in seen if "at once" in str(one.message)]
+    assert len(jumps) == (0 if resets else 2) and all("Displacement(side='" in one for one in jumps)
 
 
 def test_a_side_of_moving_bodies_does_not_become_quiet():

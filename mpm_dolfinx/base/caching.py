@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from itertools import starmap
 from typing import Any, Generic, TypeVar
 
 from mpi4py import MPI
@@ -67,7 +68,8 @@ def same(a: Any, b: Any) -> bool:
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(map(same, a, b))
+        others = [pair for pair in zip(a, b, strict=False) if pair[0] is not pair[1]]
+        return len(a) == len(b) and all(starmap(same, others))
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.shape == b.shape and bool(np.logical_and.reduce(a == b, axis=None))
     return not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and bool(a == b)

@@ -76,10 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return the rows with these columns, name -> values (n, ...), and these outcomes (n,).
-
-        Raise ValueError if columns are missing or unknown, or differ in length.
-        """
+        """Return rows from columns (name -> values (n, ...)) and outcomes (n,); raise ValueError if they do not fit."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:

@@ -328,9 +328,7 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
     vertices[number] = x
     vertices = _plane(dim, vertices, {kind: cells})
     order = np.lexsort(vertices[cells].mean(axis=1).T)
-    cells = cells[order]
-    tag = tag[order]
-    side = side[order]
+    cells, tag, side = (values[order] for values in (cells, tag, side))
     parts = {name: {kind: np.flatnonzero(rows)} for name, rows in numbered(tag, names)}
     sides = {
         name: [cells[on[:, k]][:, corners] for k, corners in enumerate(_facets(dim, kind))]

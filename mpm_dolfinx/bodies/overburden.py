@@ -59,9 +59,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
     np.maximum.at(surface, ray, height)
     # positions on the same vertical line share cumulative sums, sorted by line and height
     order = np.lexsort((height, ray))
-    ray = ray[order]
-    height = height[order]
-    weight = weight[order]
+    ray, height, weight = (values[order] for values in (ray, height, weight))
     base, scale = x[:, -1].min(initial=np.inf), 1 + np.ptp(corners[..., -1])
     height = height - base
     ends = np.searchsorted(ray, line, side="right")

@@ -37,6 +37,8 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """Reactions, outflows and other results of the conditions: quantity, such as "reactions" -> condition -> values."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Quantities that the conditions of the package return."""
+OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
+"""Further quantities of scenes with rain."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 """Further quantities of free tools."""
 
@@ -95,6 +97,7 @@ class Place(NamedTuple):
     """Positions and times at which conditions act in a substep."""
 
     cut: CutDomains  # particle domains cut by the grid
+    fill: NDArray[np.float64]  # volume fraction of the local cells
     points: MaterialPoints  # material points at the start of the step
     pieces: Any  # quadrature points, see `QuadratureData`
     start: float  # start of the step, s

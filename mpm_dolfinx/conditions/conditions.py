@@ -44,6 +44,10 @@ class Condition:
     """Attributes that may be functions, and the allowed parameters of each."""
 
     def __post_init__(self):
+        for name in ("side", "other"):
+            if not isinstance(getattr(self, name, ""), str):
+                what = f"{type(self).__name__}: {name} = {line(getattr(self, name))}"
+                raise ValueError(f"{what}, must be the name of one side; give one condition for each side")
         for name, value in vars(self).items():
             if isinstance(value, (list, tuple, np.ndarray)):
                 object.__setattr__(self, name, deepcopy(value))
@@ -126,7 +130,8 @@ class Quiet(Condition):
 
     The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
     the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few
-    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.
+    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies
+    with weight need such a stage.
 
     Parameters
     ----------
@@ -141,7 +146,8 @@ class Quiet(Condition):
     ------
     ValueError
         From the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the side;
-        another `Quiet` on the same part of a face.
+        another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid that
+        fixes it; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
     side: str
@@ -369,7 +375,8 @@ class Tied(Condition):
     Raises
     ------
     ValueError
-        From the scene: the sides are not opposite, or their faces differ.
+        From the scene: the sides are not opposite, or their faces differ; another `Tied`, a `Quiet`, `Drained`,
+        `Inflow` or `Rain` on the same part of a face.
     """
 
     side: str

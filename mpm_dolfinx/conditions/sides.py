@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.conditions.conditions import Displacement
 from mpm_dolfinx.domains.cut_domains import Patches
-from mpm_dolfinx.grid.grid import Grid, ranges, rounding
-from mpm_dolfinx.parallel.exchange import Exchange, first
+from mpm_dolfinx.grid.grid import SIDES, Grid, ranges, rounding
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -123,6 +123,24 @@ class Sides:
             end = grid.in_cells(there[None])[0, a]
         share = (sign * np.sign(slope[a]) * end) % 1.0
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
+
+    def check_moves(self, one, holds: Iterable[Displacement], free: NDArray[np.bool_]) -> None:
+        """Raise ValueError if a displacement or a wall of the grid fixes all components of faces of a condition.
+
+        `holds` are the prescribed displacements of the stage; `free` (nodes, d) are components that no wall fixes.
+        """
+        faces, grid = self.of(one), self.grid
+        for hold in holds:
+            if len(hold.axes(grid.dim)) == grid.dim:
+                check_apart(one, faces, hold, self.of(hold))
+        x = faces.places()
+        for wall, (axis, end) in SIDES[grid.dim].items():
+            fixed = not over_all(grid.comm, int(free[grid.wall_nodes(wall)].sum()))
+            off = np.abs(x[:, :, axis] - (grid.lower, grid.upper)[end][axis]).max(axis=1)
+            on = np.flatnonzero(off <= NEAR * grid.finest[axis])
+            if fixed and len(on):
+                what = f"{line(one)}: the wall {wall!r} of the grid fixes the side at {x[on[0]].mean(axis=0)}"
+                raise ValueError(f"{what}, must leave it free in this stage")
 
     def around(self, bodies: Sequence[int]) -> Surface:
         """Return all surface faces of some active bodies, including faces in contact with other bodies."""

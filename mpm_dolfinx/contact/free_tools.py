@@ -181,16 +181,16 @@ class FreeTools(ContactProblem):
         S = sums[:, :, 3:]
         if d == 2:  # the lever arm changes as the tool moves
             S[:, d, :d] += np.einsum("kij,ki->kj", self._guides[:, :d, :d], across(sums[:, :d, 0]))
-        resists = self._rate * self._mass
-        inertial = resists * (found.motion - self._free)
-        S = self._guides @ S + resists[:, None] * np.eye(len(motions))
+        inertia = self._rate * self._mass
+        inertial = inertia * (found.motion - self._free)
+        S = self._guides @ S + inertia[:, None] * np.eye(len(motions))
         free = self._free_tools
         inverse = np.zeros_like(S)
         inverse[free] = self._guides[free] @ np.linalg.inv(S[free])
         off = self._pushes - inertial - np.einsum("kij,kj->ki", self._guides, sums[:, :, 0])
         scale = np.maximum(np.abs([self._pushes, inertial]).max(axis=0), self._guides.any(axis=2) * sums[:, :, 1])
         scale[:, :d] = np.linalg.norm(scale[:, :d], axis=1, keepdims=True)
-        rounding = sums[:, :, 2] + ROUND_OFF * resists * (np.abs(found.motion) + np.abs(self._free))
+        rounding = sums[:, :, 2] + ROUND_OFF * inertia * (np.abs(found.motion) + np.abs(self._free))
         scale = np.maximum(scale, rounding / SAME)
         share = (np.abs(off) / np.where(scale > 0, scale, 1.0)).max(axis=1)
         return MotionEquation(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))

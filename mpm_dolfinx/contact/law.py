@@ -237,7 +237,7 @@ class ContactLaw:
         `x` (m, d), m, are the positions of the points.  Raise NotConverged after ROUNDS augmentations.
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
-        plane = self.total(self.pairs.area / self.grid.around(x))
+        plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
         whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.key % self.grid.num_local)))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
         most = over_all(self.grid.comm, float(off.max(initial=0.0)), MPI.MAX)

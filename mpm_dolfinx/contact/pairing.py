@@ -236,10 +236,7 @@ class Contacts(Touching):
         t, gap = _along(facets.corners[other], x[row], n[row])
         h = self._sizes(x[row])
         valid = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * h) & (gap >= -DEEP * h)
-        row = row[valid]
-        other = other[valid]
-        t = t[valid]
-        gap = gap[valid]
+        row, other, t, gap = (values[valid] for values in (row, other, t, gap))
         order = np.lexsort((np.abs(gap), row))
         order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]
         return facets, Pairs(row[order], other[order], t[order], gap[order])

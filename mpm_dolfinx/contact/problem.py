@@ -174,7 +174,7 @@ class ContactProblem(Loads):
 
     @property
     def _still(self) -> NDArray[np.float64]:
-        """No displacements by loads: (k,), or (k, q) with free tools."""
+        """Zero displacements of tools by loads: (k,), or with free tools (k, q)."""
         return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
 
     def found(self, at: At) -> Found:

@@ -8,6 +8,7 @@ are measured from the seeded positions, so errors do not accumulate.  Forces on 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import combinations, product
 
 from petsc4py import PETSc
 
@@ -16,12 +17,13 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import HOLD, Tied, holding
-from mpm_dolfinx.conditions.sides import gathered
+from mpm_dolfinx.conditions.conditions import HOLD, Drained, Inflow, Quiet, Rain, Tied, holding
+from mpm_dolfinx.conditions.sides import check_apart, gathered
 from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix, shape_values_in
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
@@ -43,7 +45,7 @@ class Tie:
         alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
         small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
         if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
-            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a box with equal faces")
+            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a body from mpm.box, with equal faces")
         self.offset = opposite[self.partner] - at
 
 
@@ -58,7 +60,7 @@ class Ties(Acting):
     Raises
     ------
     ValueError
-        The sides are not opposite, or their faces differ.
+        The sides are not opposite, or their faces differ; a side is tied twice, quiet, or open to water.
     """
 
     conditions, title = (Tied,), "tied sides"
@@ -67,6 +69,11 @@ class Ties(Acting):
         self._grid, self._materials = setting.grid, setting.materials
         of = setting.sides.of
         self._ties = [Tie(tied, of(tied), of(Tied(tied.other, tied.side))) for tied in ties.values()]
+        sides = [(tied, (tie.one, tie.other)) for tied, tie in zip(ties.values(), self._ties, strict=True)]
+        excluded = [(one, (of(one),)) for one in setting.of(Quiet, Drained, Inflow, Rain).values()]
+        for (one, faces), (other, others) in [*combinations(sides, 2), *product(sides, excluded)]:
+            for a, b in product(faces, others):
+                check_apart(one, a, other, b)
 
     @property
     def surfaces(self) -> list[Surface]:
@@ -117,13 +124,14 @@ class TieLoads(Loads):
 
     def __init__(self, grid: Grid, cell, x, other, y, stiffness: NDArray[np.float64], gap: NDArray[np.float64]):
         self._grid = grid
-        self._cell, self._other = cell, other
-        self._values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
+        values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
+        self._difference = lambda unknowns: at_nodes(grid, unknowns, cell, values, other)
+        self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return the matrix B, which maps the unknowns to differences of displacements (m d,), m."""
-        return at_nodes(self._grid, unknowns, self._cell, self._values, self._other)
+        return self._operator((unknowns,), lambda: self._difference(unknowns), self._grid.comm)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the penalty forces at u."""
@@ -131,20 +139,17 @@ class TieLoads(Loads):
         w = B.createVecLeft()
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         w.array_w[:] = self._stiffness * (w.array_r + self._gap)
-        B = B if on is at.unknowns else self._B(on)
+        B = B if on is at.unknowns else self._difference(on)
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a zero matrix with the pattern of `coupling`."""
-        out = self._coupling(unknowns)
+        out = self.coupling(At(unknowns, np.empty(0)))  # it does not depend on the displacement
         out.zeroEntries()
         return out
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return the derivative of the penalty forces."""
-        return self._coupling(at.unknowns)
-
-    def _coupling(self, unknowns: Unknowns) -> PETSc.Mat:
-        B = self._B(unknowns)
+        B = self._B(at.unknowns)
         k = scipy.sparse.diags(self._stiffness, format="csr")
         return petsc_matrix(k, B.getLocalSize()[0], self._grid.comm, own=True).PtAP(B)

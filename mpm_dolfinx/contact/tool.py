@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy, deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -64,7 +64,7 @@ def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) ->
     return np.append(by_forces, angle[name]) if name in angle else by_forces
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Tool:
     """Rigid tool in contact with the surface of the bodies, at any position of the surface.
 
@@ -95,9 +95,9 @@ class Tool:
         Direction of the load, of any length.  In axisymmetry: along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
-        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  It is at rest while
-        an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity `outcome("tool_velocity")`
-        (d,), m/s.
+        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  It keeps its
+        position while an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity
+        `outcome("tool_velocity")` (d,), m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
@@ -132,6 +132,11 @@ class Tool:
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
     _moved: ClassVar[Shape | None] = None
 
+    def __repr__(self) -> str:
+        """Return the constructor's call without defaults, for messages."""
+        given = [f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if getattr(self, f.name) is not f.default]
+        return f"Tool({', '.join(given)})"
+
     def __post_init__(self):
         if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
             raise ValueError(f"Tool: shape = {line(self.shape)}, must be a HalfSpace, Ball, Convex, Cone or a function")
@@ -139,7 +144,8 @@ class Tool:
             value = getattr(self, name)
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
         if (self.load is None) != (self.direction is None) and (self.load is not None or self.mass is None):
-            raise ValueError(f"{line(self)}: load and direction, must be given together")
+            what = f"Tool: load = {line(self.load)} and direction = {line(self.direction)}"
+            raise ValueError(f"{what}, must be given together")
         self._check_free()
         for name in ("displacement", "rotation_rad", "load"):
             value = getattr(self, name)
@@ -155,7 +161,7 @@ class Tool:
         if self.mass is None:
             of_free = {"velocity": self.velocity is None, "moment": self.moment is None, "spin": self.spin == 0}
             for name in [name for name, absent in of_free.items() if not absent][:1]:
-                raise ValueError(f"{line(self)}: {name}, must be given with a mass")
+                raise ValueError(f"Tool: {name} = {line(getattr(self, name))}, must be given with a mass")
             return
         numbers("Tool: mass", self.mass, test=lambda v: (v > 0) & (v < np.inf), allowed="> 0 and finite")
         numbers("Tool: spin", self.spin)
@@ -244,7 +250,7 @@ class Tool:
         if of != dim:
             raise ValueError(f"{line(self)}: a shape in {of}D, must be in {dim}D as the grid")
         if dim == 3 and (callable(self.rotation_rad) or self.rotation_rad):
-            raise ValueError(f"{line(self)}: rotation_rad, must be 0 in 3D")
+            raise ValueError(f"Tool: rotation_rad = {line(self.rotation_rad)}, must be 0 in 3D")
         for name in ("displacement", "rotation_rad"):  # values of functions are checked when they are used
             if not callable(getattr(self, name)):
                 self._given(name, 0.0, dim if name == "displacement" else 0)
@@ -257,15 +263,16 @@ class Tool:
         """Raise an error for invalid rotation of a free tool."""
         of, rotates = self._uniform(dim), self.rotates(dim)
         if dim == 3 and rotates:
-            raise ValueError(f"{line(self)}: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")
+            raise ValueError(f"Tool: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")
         if self.spin and not rotates:
-            raise ValueError(f"{line(self)}: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
+            raise ValueError(f"Tool: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
         if not rotates:
             return
         if self.centre is None and of is None:
-            raise ValueError(f"{line(self)}: moment, must be given with the centre of this shape")
+            raise ValueError(f"Tool: moment = {line(self.moment)}, must be given with the centre of this shape")
         if self.moment is None and not np.allclose(self._centre(dim) + self._base, of.centroid, atol=ROUNDED):
-            raise ValueError(f"{line(self)}: centre, must be the centroid {of.centroid}, or be given with a moment")
+            what = f"Tool: centre = {line(self.centre)}, must be the centroid {of.centroid}"
+            raise ValueError(f"{what}, or be given with a moment")
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:

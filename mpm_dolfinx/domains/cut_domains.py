@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from math import prod
 
 from mpi4py import MPI
 
@@ -132,9 +133,8 @@ class CutDomains(Keyed):
         `part` (n,) is the number of the part to which each point belongs.
         """
         far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
-        largest = np.full(count, far.max(initial=0.0))
+        largest = np.zeros(count) if count > 1 else far.max(initial=0.0, keepdims=True)
         if count > 1:
-            largest[:] = 0.0
             np.maximum.at(largest, part, far)
         return over_all(self.grid.comm, largest, MPI.MAX)
 
@@ -155,19 +155,16 @@ class CutDomains(Keyed):
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, m^2, and plane centroids.
-
-        `volume` (m,) are the volumes of the pieces, m^d.
-        """
+        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of plane sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return for each point the volume mean (n, ...) of values (m, ...) of its pieces."""
-        columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
-        means = [sum_by(self.pieces.point, self.pieces.fraction * column, len(self.points)) for column in columns]
-        return np.stack(means, axis=1).reshape(len(self.points), *values.shape[1:])
+        columns = values.reshape(len(values), prod(values.shape[1:])).T
+        means = sum_by(self.pieces.point, self.pieces.fraction * columns, len(self.points))
+        return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return means as in `mean` for values at centroids in the plane; in axisymmetry weighted by area."""

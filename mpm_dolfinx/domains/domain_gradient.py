@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import TURN, sum_by
 from mpm_dolfinx.points.cutting import FACE_SIGNS, FACES, cross, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
@@ -49,6 +49,13 @@ def _of_hexahedra(
     F is the sum over the corners k of x_k times dV/dX_k, divided by V.  The last axis of the arrays is the point.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
+    slope = _slopes(X)
+    volume = (X * slope).sum(axis=(0, 1)) / 3
+    return np.moveaxis(np.einsum("kan,kbn->abn", x, slope) / volume, 2, 0).copy(), volume
+
+
+def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives (8, 3, n), m^2, of the volumes of hexahedra by their corners X (8, 3, n), m."""
     slope = np.zeros_like(X)
     for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
         p, q, r, s = X[face]
@@ -58,8 +65,28 @@ def _of_hexahedra(
         area, by_a, by_b = (sign / 24 * cross(*pair) for pair in ((a, b), (b, total), (total, a)))
         for corner, own in zip(face, (-by_a, -by_b, by_b, by_a), strict=True):
             slope[corner] += area + own
-    volume = (X * slope).sum(axis=(0, 1)) / 3
-    return np.moveaxis(np.einsum("kan,kbn->abn", x, slope) / volume, 2, 0).copy(), volume
+    return slope
+
+
+def volume_slopes(
+    corners: NDArray[np.float64], axisymmetric: bool = False
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the volumes (n,) of domains, m^d, and their derivatives (n, 2^d, d) by the corners, m^(d-1).
+
+    In axisymmetry volumes of rings, m^3, the integrals of pi r^2 dz around the domains, and their derivatives, m^2.
+    """
+    now = domain_volumes(corners, axisymmetric)
+    if corners.shape[2] == 3:
+        return now, _slopes((corners - corners[:, :1]).transpose(1, 2, 0)).transpose(2, 0, 1)
+    if not axisymmetric:
+        other = (corners[:, [1, 3, 0, 2]] - corners[:, [2, 0, 3, 1]])[:, :, ::-1]  # diagonals
+        return now, other * [0.5, -0.5]
+    ring = [0, 1, 3, 2]
+    (r, z), (r_next, z_next) = (np.moveaxis(corners[:, np.roll(ring, -k)], 2, 0) for k in (0, 1))
+    along, square = z_next - z, r**2 + r * r_next + r_next**2
+    by_r = (2 * r + r_next) * along + np.roll((r + 2 * r_next) * along, 1, axis=1)
+    slope = np.stack([by_r, np.roll(square, 1, axis=1) - square], axis=2)
+    return now, TURN / 6 * slope[:, ring]
 
 
 def cell_ratios(

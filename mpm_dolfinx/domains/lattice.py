@@ -95,6 +95,10 @@ class Lattice:
         """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
         return self._held_of(ids)[0]
 
+    def corners_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the numbers (m, 2^d) of corners of domains, and which of these corners touch other bodies."""
+        return self._nodes(ids), self._held_of(ids)[1]
+
     def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return the result of `given`, and which corners (m, 2^d) of the domains touch other bodies."""
 
@@ -168,8 +172,8 @@ def _change(
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]
-            apart = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
-            field[sites[np.logical_or.reduce(apart.T)]] = np.nan
+            differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
+            field[sites[np.logical_or.reduce(differs.T)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     if thirds is not None:  # the part of this slab
         thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
@@ -241,10 +245,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners are prescribed by a condition or fixed by a wall.
-
-    `walls` are the fixed components of each wall, by name.
-    """
+    """Return which components (n, 2^d, d) of corners a condition prescribes, or `walls` (name -> components) fix."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -255,6 +256,27 @@ def given(
         for letter in axes:
             out[:, :, "xyz".index(letter)] |= at_wall
     return out
+
+
+def stopped(
+    grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return corners (n, 2^d, d), m, that pass no wall, and leave the grid only if they did `before` a correction."""
+    shut = np.zeros((2, grid.dim), dtype=bool)
+    for name, axes in walls.items():
+        axis, end = SIDES[grid.dim][name]
+        shut[end, axis] = "xyz"[axis] in axes
+    corners = np.where(shut[0] | (before >= grid.low), np.maximum(corners, grid.low), corners)
+    return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
+
+
+def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the numbers (n, 2^d) of corners in their bodies, -1 for renewed domains, and which touch other bodies."""
+    numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
+    for lattice in lattices:
+        rows = lattice.rows(points)
+        numbers[rows], touching[rows] = lattice.corners_of(points.id[rows])
+    return numbers, touching
 
 
 def filtered(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import Quiet
+from mpm_dolfinx.conditions.conditions import Displacement, Quiet
 from mpm_dolfinx.conditions.sides import check_apart, gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.velocity import Velocity
@@ -54,7 +54,7 @@ class QuietSides(Acting):
     Raises
     ------
     ValueError
-        Two quiet sides share a part of a face.
+        Two quiet sides share a part of a face, or a displacement or a wall of the grid fixes all components of a face.
     """
 
     conditions, title = (Quiet,), "quiet sides"
@@ -67,6 +67,7 @@ class QuietSides(Acting):
             check_apart(one, faces, other, others)
         for side in sides.values():
             side.at(0.0, self._grid.dim)
+            setting.sides.check_moves(side, setting.of(Displacement).values(), setting.free)
 
     def named(self, names: Collection[str]) -> dict[str, Surface]:
         """Return the faces of the named sides."""

@@ -102,11 +102,9 @@ class MixedCells:
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
-        x = self._x[line]
-        low = low[piece]
-        high = high[piece]
-        # mean over lines on both sides: a border of two pieces along a line is known only within rounding
-        inside = np.mean([(low <= near) & (near <= high) for near in (x - NEAR / 2, x + NEAR / 2)], axis=0)
+        # means of lines on both sides, because borders of pieces lie on a line only within rounding
+        places = [self._x[line] + shift for shift in (-NEAR / 2, NEAR / 2)]
+        inside = np.mean([(low[piece] <= x) & (x <= high[piece]) for x in places], axis=0)
         out = []
         for axis in range(self._x.shape[1]):
             fraction = np.delete(inside, axis, axis=1).prod(axis=1)

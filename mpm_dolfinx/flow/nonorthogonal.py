@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.flow.fluxes import CellContents, FluxForms, OpenSides
 from mpm_dolfinx.forms.point_forms import FacetSum
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
 """Offset of two centroids along a face, in cells, up to which they need no correction."""
@@ -70,7 +70,7 @@ class Gradients:
         share = contents.open
         towards = np.repeat(np.arange(d), 2)
         at, normal = contents.slot(sides.cells), sides.normal
-        tangential = sides.offset - np.einsum("md,md->m", sides.offset, normal)[:, None] * normal
+        tangential = _along(sides)
         neighbours = grid.neighbours(contents.filled)
         cells = np.maximum(neighbours, 0)
         inside = (neighbours >= 0) & (share[contents.filled] > 0)
@@ -82,7 +82,7 @@ class Gradients:
         along[:, np.arange(2 * d), towards] = 0.0
         h = grid.sizes(contents.filled)
         off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
-        off[at[_off_middle(sides, tangential / grid.sizes(sides.cells))]] = True
+        off[at[off_middle(sides, grid)]] = True
         self.rows = rows = np.flatnonzero(off)
         """Indices of the cells that need the correction, among the filled cells."""
         distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
@@ -188,11 +188,9 @@ class NonorthogonalFlow(NamedTuple):
         The corrections apply to the cell pressure at open sides.  `p` (c,), Pa, are the pressures of the local cells;
         `bulk`, Pa, is the bulk modulus of the fluid.
         """
-        filled, active = self.contents.filled, self.contents.active
-        if not self.facets.some and not len(self.gradients.rows):
-            return np.zeros(len(filled)), np.zeros(len(self.sides.cells))
         slope = self.gradients(p, self.sides.pressure, self.weight)
         through = self.gradients.through_sides(slope, len(self.sides.cells))
+        filled, active = self.contents.filled, self.contents.active
         if not self.facets.some:
             return np.zeros(len(filled)), through
         density = np.exp(p[active] / bulk)
@@ -200,13 +198,16 @@ class NonorthogonalFlow(NamedTuple):
         return outflow[filled], through
 
 
-def _off_middle(sides: OpenSides, off: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether the faces of its condition in its cell are offset from the cell's centroid.
-
-    `off` (m, d), in cells, are vectors along the faces from the foot of the centroid.  The faces' mean vector decides.
-    """
+def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
+    """Return for each face (m,) whether its condition's faces in the cell are not opposite the cell's centroid."""
     _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
     at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
     count = int(at.max(initial=-1)) + 1
+    off = _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, count) / sum_by(at, size, count)
     return (np.abs(mean) > ALONG).any(axis=0)[at]
+
+
+def _along(sides: OpenSides) -> NDArray[np.float64]:
+    """Return vectors (m, d), m, along the faces, from the foot of the cell's centroid to the face's centre."""
+    return sides.offset - np.einsum("md,md->m", sides.offset, sides.normal)[:, None] * sides.normal

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache, cached_property, partial, reduce
+from math import prod
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -23,7 +24,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
-from mpm_dolfinx.grid.lines import checked, equal, rounding
+from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
 from mpm_dolfinx.grid.partition import destinations, owners
 
 SIDES = {
@@ -37,8 +38,6 @@ TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
 """Number of rows that are processed together, which limits the size of temporary arrays."""
-MOST = 2**31 - 1
-"""Largest number of unknowns for PETSc's 32-bit integers."""
 SNAP = 1e-10
 """Distance to a grid plane, in cells, below which a vertex lies on the plane, unless rounding errors are larger."""
 ORDER = "the order is Grid(lower, upper, cells)"
@@ -59,11 +58,11 @@ def in_chunks(count: int) -> list[slice]:
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the sums (..., size) of values (..., n) by index (n,), as floats (`np.bincount` may return ints)."""
-    if values.ndim > 1:
-        rows = values.reshape(int(np.prod(values.shape[:-1])), len(index))  # also for no rows
-        index, whole = (index + size * np.arange(len(rows))[:, None]).ravel(), size * len(rows)
-        return sum_by(index, rows.ravel(), whole).reshape(*values.shape[:-1], size)
-    return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
+    shape = values.shape[:-1]
+    if shape:
+        index = (index + size * np.arange(prod(shape))[:, None]).ravel()
+    sums = np.bincount(index, weights=values.ravel(), minlength=size * prod(shape))
+    return sums.astype(float, copy=False).reshape(*shape, size)
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -213,7 +212,8 @@ class Grid:
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
         the tool, and the cells around them widen or narrow.  A function of time t (s) and positions x (n, d) of all
-        points (parameters t, x or both) returns the same number of lines, between the same sides.
+        points (parameters t, x or both) returns the same number of lines, between the same sides.  A tool must be a
+        condition of the first stage; lines stay in stages without it.
     axisymmetric
         The first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes, forces
         and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is

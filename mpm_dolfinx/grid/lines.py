@@ -12,6 +12,9 @@ from scipy.optimize import brentq
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import line, numbers
 
+MOST = 2**31 - 1
+"""Largest number of unknowns for PETSc's 32-bit integers."""
+
 
 def rounding(x: NDArray[np.float64]) -> float:
     """Return the largest rounding error, m, of coordinates like x."""
@@ -72,13 +75,16 @@ def graded(
     Raises
     ------
     ValueError
-        Boxes outside the grid, or numbers out of range.
+        Boxes outside the grid, numbers out of range, or more cells than a grid can have.
     """
     lower = numbers("graded: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
     d = lower.size
     upper = numbers("graded: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
-    size = np.broadcast_to(
-        numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf)), (d,)
+    given, size = (
+        size,
+        np.broadcast_to(
+            numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf)), (d,)
+        ),
     )
     ratio = float(numbers("graded: ratio", ratio, allowed="> 1", test=lambda v: (v > 1) & (v < np.inf)))
     if largest != np.inf:
@@ -89,6 +95,9 @@ def graded(
         raise ValueError(f"graded: fine = {line(fine)}, must be {allowed}")
     if not (boxes[:, 0] >= lower - rounding(lower)).all() or not (boxes[:, 1] <= upper + rounding(upper)).all():
         raise ValueError(f"graded: fine = {line(fine)}, must be in {lower.tolist()} to {upper.tolist()}")
+    cells = np.prod(np.maximum(1.0, np.ptp(boxes, axis=1).max(axis=0) / size))
+    if cells > MOST / d:
+        raise ValueError(f"graded: size = {line(given)}: the box has {cells:.3g} cells, must have at most {MOST // d}")
     return [_along(lower[a], upper[a], boxes[:, :, a], size[a], ratio, largest) for a in range(d)]
 
 
@@ -132,9 +141,10 @@ def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[n
     def edges(growth: float, count: int) -> NDArray[np.float64]:
         return np.minimum(size * growth ** np.arange(1, count + 1), largest)
 
-    count = 1
-    while edges(ratio, count).sum() < gap:
-        count += 1
+    enough = 1
+    while edges(ratio, enough).sum() < gap:
+        enough *= 2
+    count = 1 + int(np.cumsum(edges(ratio, enough))[:-1].searchsorted(gap))
     best = None
     for n in {count, max(1, count - 1)}:
         most = gap / size + 1

@@ -355,10 +355,9 @@ def _check_trend(trend: Trend, points: MaterialPoints) -> None:
     """Raise ValueError for a trend that does not belong to the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d, 1 + d)
-    if not right or not all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values()):
-        raise ValueError("trend: does not fit the points, or is not finite")
-    if not (trend.lengths > 0).all():
-        raise ValueError("trend: lengths: steps must be > 0")
+    numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
+    if not (right and numbers_only and (trend.lengths > 0).all()):
+        raise ValueError("trend: does not fit the points, is not finite, or has a step without length")
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:

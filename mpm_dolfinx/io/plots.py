@@ -27,8 +27,8 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
         A scene in plane strain or axisymmetry.
     field
         "pressure", "displacement" (its magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
-        "mean_effective_stress", "deviatoric_stress", "porosity", "J", and any other scalar in `points.pvd` and
-        `points.data`.
+        "mean_effective_stress", "deviatoric_stress", "porosity", "J", of unsaturated soil "saturation" and "suction",
+        and any other scalar in `points.pvd` and `points.data`.
     ax
         Axes for the picture; by default new axes.
     bar
@@ -67,7 +67,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     radius = "r" if simulation.grid.axisymmetric else "x"
     ax.set(aspect="equal", xlabel=f"{radius} (m)", ylabel="y (m)")
     if bar:
-        known = unit(field)
+        known = unit("pressure" if field == "suction" else field)
         label = label or field.replace("_", " ") + (f" ({known})" if known else "")
         cax = ax.inset_axes(bounds=(1.03, 0, 0.04, 1))  # as high as the axes, which may be flat
         ax.figure.colorbar(drawn, cax=cax).ax.set_title(label, loc="right", fontsize="medium")
@@ -87,10 +87,14 @@ def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     }
     if simulation.scene.fluid is not None:
         known["pressure"] = lambda: points.pressure
+    if simulation.scene.materials.retentions is not None:
+        known["suction"] = lambda: np.maximum(-points.pressure, 0.0)
     known |= {name: lambda rows=rows: rows for name, rows in {**points.data, **fields}.items() if rows.ndim == 1}
     if simulation.scene.fluid is None:  # the effective stress is the stress
         known |= {name.removeprefix("effective_"): known[name] for name in known if name.startswith("effective_")}
     if field not in known:
-        names = ", ".join({**known, **(fields or fields_of_points(simulation))})
+        names = ", ".join(
+            name for name in {**known, **(fields or fields_of_points(simulation))} if name not in points.INTERNAL
+        )
         raise ValueError(f"plot: field = {line(field)}, must be one of {names}")
     return np.asarray(known[field](), dtype=np.float64)

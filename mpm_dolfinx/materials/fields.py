@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import TINY
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
@@ -187,6 +187,8 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
+        if self.fluid is None and m.retention is not None:
+            raise ValueError(f"{law.__name__}: retention = {line(m.retention)}, must be None without a fluid")
         if "suction" in law.state and self.fluid is not None and m.retention is None:
             raise ValueError(f"{law.__name__}: retention = None, must be a retention curve for a law with suction")
         if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:

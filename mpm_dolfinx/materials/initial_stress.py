@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints
 
 EXACT, CLOSE = 1e-13, SAME  # errors of the stress / largest initial stress: at which Newton's method ends, and allowed
 MOST = 30  # Newton iterations
@@ -253,17 +253,13 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved.
-
-    points: n points; target (n, 3, 3): stress, Pa.
-    given (n,): whether the stress is a parameter; plastic (n,): whether C_p^-1 is a state variable.
-    """
+    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved."""
 
     materials: SceneMaterials
-    points: MaterialPoints
-    target: NDArray[np.float64]
-    given: NDArray[np.bool_]
-    plastic: NDArray[np.bool_]
+    points: MaterialPoints  # n points
+    target: NDArray[np.float64]  # (n, 3, 3) stress, Pa
+    given: NDArray[np.bool_]  # (n,) whether the stress is a parameter
+    plastic: NDArray[np.bool_]  # (n,) whether C_p^-1 is a state variable
 
     @property
     def components(self) -> tuple[tuple[int, int], ...]:
@@ -350,7 +346,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
     F = moved.F_of_laws
     d = F.shape[1]
     law = materials.law_of(points)
-    own = {name: points.data[name] for name in ("softness", "owed", "due", ACROSS) if name in points.data}
+    own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
     whole = np.tile(np.eye(3), (len(F), 1, 1))
@@ -380,6 +376,11 @@ def _kappa(m) -> NDArray[np.float64]:
     return m.kappa if isinstance(m, ModifiedCamClay) else np.ones(np.shape(m.bulk))
 
 
+def _friction(m) -> NDArray[np.float64]:
+    """Return the friction angle, degrees, nan for laws without one."""
+    return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
+
+
 def _prestretch(m) -> NDArray[np.float64]:
     return m.prestretch if isinstance(m, ModifiedCamClay) else np.ones((*np.shape(m.bulk), 3))
 
@@ -398,4 +399,12 @@ def _outside_yield(materials: SceneMaterials, points: MaterialPoints, target: ND
     allowed = f"inside the yield surface of {name}"
     tension = np.trace(target[i]) > 0  # the pore pressure exceeds the overburden
     more = "; K0 needs the weight of open water as surcharge" if tension and points.pressure[i] > 0 else ""
-    return f"initial_stress at {points.x[i] + materials.grid.base}: {target[i].tolist()} Pa, must be {allowed}{more}"
+    friction = materials.table(points, _friction)[i]
+    if np.isfinite(friction):
+        ratio = np.tan(np.radians(45 + friction / 2)) ** 2
+        allowed += (
+            f": without cohesion, friction = {friction:.4g} degrees allows K0 from {1 / ratio:.3g} to {ratio:.3g}"
+        )
+    stress = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(target[i]))
+    where = points.x[i] + materials.grid.base
+    return f"initial_stress at {where}: principal stresses {stress} Pa, must be {allowed}{more}"

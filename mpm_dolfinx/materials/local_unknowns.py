@@ -36,19 +36,19 @@ MOST, HALVINGS = 60, 25  # Newton iterations, and step halvings in all iteration
 
 
 class Solved(NamedTuple):
-    """Solution at some points: key of their data; unknowns (n, m); trial values (n, k); function for derivatives."""
+    """Solution of the local equations at n points."""
 
-    key: object
-    unknowns: NDArray[np.float64]
-    trial: NDArray[np.float64]
-    derive: Callable[[], Derived]
+    key: object  # of the points' data
+    unknowns: NDArray[np.float64]  # (n, m)
+    trial: NDArray[np.float64]  # trial values (n, k)
+    derive: Callable[[], Derived]  # function that returns the derivatives
 
 
 class Derived(NamedTuple):
-    """Derivatives with respect to the trial values: slopes Y (n, m k); for laws with an energy bends (n, m k k)."""
+    """Derivatives of the unknowns with respect to the trial values, at n points."""
 
-    slopes: NDArray[np.float64]
-    bends: NDArray[np.float64] | None = None
+    slopes: NDArray[np.float64]  # first derivatives Y (n, m k)
+    bends: NDArray[np.float64] | None = None  # second derivatives (n, m k k), for laws with an energy
 
 
 class LocalUnknowns:
@@ -339,10 +339,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
         y[rows] = old - step  # for close points this is the solution
         on = ~(close | failed[rows])
-        rows = rows[on]
-        step = step[on]
-        old = old[on]
-        norm = norm[on]
+        rows, step, old, norm = (values[on] for values in (rows, step, old, norm))
         length = np.ones(int(on.sum()))
         if not len(rows):
             break
@@ -353,9 +350,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
             f[worse], slope[worse], new[worse] = system(rows[worse], old[worse] - length[worse, None] * step[worse])
         failed[rows] = ~(new < norm)
         on = ~failed[rows]
-        rows = rows[on]
-        f = f[on]
-        slope = slope[on]
+        rows, f, slope = (values[on] for values in (rows, f, slope))
         norm = new[on]
     failed[rows] = True  # after so many iterations
     return np.flatnonzero(failed)

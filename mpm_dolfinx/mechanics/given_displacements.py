@@ -27,10 +27,9 @@ from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
-from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
@@ -83,6 +82,7 @@ class GivenDisplacements(Acting):
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
         self._warned: set[int] = set()  # numbers of the conditions, for the log only
+        self._jumped: set[int] = set()  # likewise, for jumps at the start
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
@@ -99,12 +99,33 @@ class GivenDisplacements(Acting):
         """Faces with prescribed displacements."""
         return [faces for _, faces, _ in self._holds]
 
+    def check_start(self, place: Place) -> None:
+        """Warn, once for each condition, if it moves its side at once as bodies with inertia begin to move.
+
+        The motion in a single step strains the cell at the side more than the stress there.
+        """
+        if not (place.inertia and place.dt):
+            return
+        points = place.points
+        tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
+        for number, (hold, faces, axes) in enumerate(self._holds):
+            p = place.cut.surface(faces)
+            gap = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
+            strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
+            sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+            jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
+            if jump and number not in self._jumped:
+                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: it %s"
+                why = "counts from the start or the last reset_displacement, must begin at the present position"
+                warn(self._grid.comm, ConditionWarning, what, line(hold), jump, place.start, why)
+                self._jumped.add(number)
+
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep: one for each component and each cell or point."""
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
         ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty: zero displacement
-        held = HeldCells(self._grid, self._held_points(place.cut, place.points, place.t, ends, place.inertia))
+        held = HeldCells(self._grid, self._held_points(place, ends))
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self._holds])
@@ -123,14 +144,14 @@ class GivenDisplacements(Acting):
         data = forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields)
         return HoldLoads(self, forms, data, held, row, own, place)
 
-    def _held_points(
-        self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
-    ) -> HeldPoints:
-        """Return the integration points on the sides, on the processes that own their cells.
+    def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
+        """Return the integration points on the sides, on the processes that own the cells of their rows.
 
-        ends: start and end of the step, s, empty for zero displacement; inertia: whether bodies have inertia.
+        ends: start and end of the step, s, empty for zero displacement.
         """
-        d, rows = self._grid.dim, []
+        cut, points = place.cut, place.points
+        d, t = self._grid.dim, place.t
+        rows, bounds = [], []
         patches = cut.surfaces([faces for _, faces, _ in self._holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
         cut_points = cut.points if ends else points  # at the positions of the cut domains
@@ -143,16 +164,23 @@ class GivenDisplacements(Acting):
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
-            if inertia and ends and t < ends[1]:
+            if place.inertia and ends and t < ends[1]:
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
-            to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
+            start, to = (p.origin(points) + given[k] for k in (1, 0))
+            given = np.concatenate(given[1:], axis=1)
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
             rows.append((p.cell, p.x, values))
+            bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
         cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
+        extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
+        sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
+        inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
+        if over_all(self._grid.comm, int((inner != cell).any())):
+            cell, x, values = gathered(self._grid, [(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
         number, *own = values[:, :6].T
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 

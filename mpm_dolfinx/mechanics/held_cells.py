@@ -9,15 +9,17 @@ the traction increment of the step only, and the gap between side and prescribed
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.conditions.conditions import HOLD, WEAK
 from mpm_dolfinx.grid.grid import Grid, among, sum_by
+from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
@@ -36,27 +38,51 @@ CARRIED = 0.3  # largest plausible traction increment of a step / (resisting mod
 
 
 class HeldPoints(NamedTuple):
-    """Integration points on sides with prescribed displacements; arrays for n points in owned cells.
+    """Integration points on sides with prescribed displacements; arrays for n points in owned cells."""
 
-    number, cell (n,): condition and local cell; area (n,): reference area, m^(d-1); x (n, d): position, m.
-    gap (n, d): prescribed minus present position, m; given (n, 2 d): prescribed displacements at both ends of the step.
-    modulus, tension, resistance, firm (n,): penalty modulus, norm of the stress, resisting modulus and confined modulus
-    at the last reset of the grid, all times area, N.
-    normal (n, d): area vector at the last reset, m^(d-1); force (n, d): present force, rotated with the side, N.
+    number: NDArray[np.int64]  # (n,) index of the condition
+    cell: NDArray[np.int32]  # (n,) local cell
+    area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N, at the last reset of the grid, as the next three
+    tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
+    resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
+    firm: NDArray[np.float64]  # (n,) confined modulus times area, N
+    x: NDArray[np.float64]  # (n, d) position, m
+    gap: NDArray[np.float64]  # (n, d) prescribed minus present position, m
+    given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
+    normal: NDArray[np.float64]  # (n, d) area vector at the last reset of the grid, m^(d-1)
+    force: NDArray[np.float64]  # (n, d) present force, rotated with the side, N
+
+
+def inner_cells(
+    grid: Grid,
+    fill: NDArray[np.float64],
+    sides: Sequence[tuple[Collection[int], NDArray[np.float64]]],
+    number: NDArray[np.int64],
+    cell: NDArray[np.int32],
+    normal: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Return the local cells (n,) of the rows that constrain the points of sides.
+
+    A flat side on a grid line is slightly wavy, so some of its cells are nearly empty. Their rows would contradict
+    those of the inner cells: only a large motion of the nodes beyond the line, which nothing resists, could satisfy
+    both. The inner cell therefore takes these points too (cell aggregation; Badia, Verdugo and Martin 2018).
+
+    fill (cells,): volume fraction; sides: prescribed components and extent (d,), m, of the prescribed positions of each
+    condition; number, cell, normal (n,), (n,), (n, d): condition, owned cell and outward area vector of each point.
     """
-
-    number: NDArray[np.int64]
-    cell: NDArray[np.int32]
-    area: NDArray[np.float64]
-    modulus: NDArray[np.float64]
-    tension: NDArray[np.float64]
-    resistance: NDArray[np.float64]
-    firm: NDArray[np.float64]
-    x: NDArray[np.float64]
-    gap: NDArray[np.float64]
-    given: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    force: NDArray[np.float64]
+    inner = cell.astype(np.int64)
+    for k, (axes, extent) in enumerate(sides):
+        axis = (extent / grid.finest).argmin()
+        if axis not in axes or extent[axis] > ALIGNED * grid.finest[axis]:
+            continue
+        own, side = (number == k).nonzero()[0], fem.Function(grid.cellwise()).x
+        side.array[cell[own]] = 1.0
+        side.scatter_forward()
+        neighbour = grid.neighbours(cell[own])[np.arange(len(own)), axis, (normal[own, axis] < 0).astype(int)]
+        aggregated = (neighbour >= 0) & (side.array[neighbour] > 0) & (fill[cell[own]] < RATIO * fill[neighbour])
+        inner[own[aggregated]] = neighbour[aggregated]
+    return inner
 
 
 class HeldCells:

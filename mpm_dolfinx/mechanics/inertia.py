@@ -425,11 +425,11 @@ class Inertia(Loads):
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns at the start of a step and after a substep, m/s; last acceleration, m/s^2."""
+    """Velocities and acceleration of the unknowns within a step."""
 
-    start: PETSc.Vec
-    velocity: PETSc.Vec
-    acceleration: PETSc.Vec | None = None
+    start: PETSc.Vec  # velocities at the start of the step, m/s
+    velocity: PETSc.Vec  # velocities after the last substep, m/s
+    acceleration: PETSc.Vec | None = None  # of the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
         """Return the inertial predictor of the next substep, m; own, before: weights of this and the last rate, s."""

@@ -224,12 +224,13 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return sums (nodes,) of cell values at the active local nodes, over all processes; values of owned cells."""
+        """Return sums (nodes,) of values (cells,), or (cells, 2^d) at their nodes, of owned cells of all processes."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
         nodes = self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
         values_at[self.active.now.dofs] = 0.0
-        values_at[nodes * d] = sum_by(at.ravel(), values.repeat(2**d), len(nodes))
+        of_cells = np.broadcast_to(values if values.ndim > 1 else values[:, None], at.shape)
+        values_at[nodes * d] = sum_by(at.ravel(), of_cells.ravel(), len(nodes))
         sum_ghosts(shared)
         shared.x.scatter_forward()
         return values_at[nodes * d]

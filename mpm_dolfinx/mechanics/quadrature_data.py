@@ -54,11 +54,11 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step; points of each part (`SceneMaterials.parts`); their indices among all points."""
+    """Integration points of a step, in all and for each part of the points: see `SceneMaterials.parts`."""
 
-    pieces: PointData
-    parts: tuple[PointData, ...]
-    rows: tuple[NDArray[np.int64] | slice, ...]
+    pieces: PointData  # all integration points
+    parts: tuple[PointData, ...]  # integration points of each part
+    rows: tuple[NDArray[np.int64] | slice, ...]  # their indices among all points
 
     def shape_gradients(self) -> NDArray[np.float64]:
         """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the points at which laws use them."""
@@ -73,14 +73,11 @@ class QuadratureData:
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Positions of the pieces of the cut domains; indices and positions of the pieces of each part.
+    """Positions of the pieces of the cut domains."""
 
-    lever (m, d), m: vectors to the pieces from the centroid of the material in their cell; None until computed.
-    """
-
-    pieces: Places
-    parts: tuple[tuple[NDArray[np.int64], Places], ...]
-    lever: NDArray[np.float64] | None = None
+    pieces: Places  # of all pieces
+    parts: tuple[tuple[NDArray[np.int64], Places], ...]  # indices and positions of the pieces of each part
+    lever: NDArray[np.float64] | None = None  # vectors (m, d), m, from the centroid of the material in the cell
 
 
 class QuadraturePoints:

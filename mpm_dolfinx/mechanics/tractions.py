@@ -223,10 +223,10 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
         real = edge[:, 0] != edge[:, 1]
         edge, x = edge[real], x[real]
     _, kind, often = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
-    lone = x[often[kind.ravel()] == 1]
-    held = np.zeros(len(lone), dtype=bool)
+    single = x[often[kind.ravel()] == 1]
+    held = np.zeros(len(single), dtype=bool)
     for axis, place in walls:
-        held |= (np.abs(lone[:, :, axis] - place) < NEAR * grid.finest[axis]).all(axis=1)
+        held |= (np.abs(single[:, :, axis] - place) < NEAR * grid.finest[axis]).all(axis=1)
     return bool(held.all() and often.max(initial=0) <= 2)
 
 

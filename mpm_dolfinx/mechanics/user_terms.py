@@ -23,12 +23,12 @@ from mpm_dolfinx.materials.user_functions import compiling, term_of
 
 
 class OwnTerm(NamedTuple):
-    """A user-defined term: definition, integration points, form, and derivative with respect to u or None."""
+    """A user-defined term."""
 
-    given: Callable | OnSide
-    points: FormPoints
+    given: Callable | OnSide  # its definition
+    points: FormPoints  # integration points
     form: PointForm
-    slope: PointForm | None
+    slope: PointForm | None  # derivative with respect to u, None if zero
 
 
 class OwnTerms:

@@ -17,14 +17,11 @@ from mpm_dolfinx.points.parts import parts_of_cells
 
 @dataclass(frozen=True, eq=False)
 class ActiveSet:
-    """The active cells of a grid, and quantities derived from them.
-
-    cells, nodes: local numbers of active cells and of nodes of active cells on any process; ascending, with ghosts.
-    """
+    """The active cells of a grid, and quantities derived from them."""
 
     grid: Grid
-    cells: NDArray[np.int64]
-    nodes: NDArray[np.int64]
+    cells: NDArray[np.int64]  # local numbers, ascending, with ghosts
+    nodes: NDArray[np.int64]  # local numbers of nodes of active cells on any process, ascending, with ghosts
 
     @cached_property
     def dofs(self) -> NDArray[np.int64]:

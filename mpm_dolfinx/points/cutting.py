@@ -36,25 +36,21 @@ TANGLED = 0.2  # volume between the corners / volume of the domain; below it cor
 
 @dataclass
 class Pieces:
-    """Pieces of particle domains; arrays for m pieces, ordered by point and cell.
+    """Pieces of particle domains; arrays for m pieces, ordered by point and cell."""
 
-    point (m,): index of the domain; cell (m,): lexicographic number of the cell.
-    fraction (m,): volume / volume of the domain; x (m, d): centroid, m.
-    faces (m, d, 2) on request, else (m, 0, 2): area of the piece on the lower and upper face of its cell along each
-    axis, m^(d-1).
-    mixed (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2.
-    hoop (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
-    product of its components, m^2; radius of this centroid, m.
-    second (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; of symmetric rings.
-    """
-
-    point: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    fraction: NDArray[np.float64]
-    x: NDArray[np.float64]
+    point: NDArray[np.int64]  # (m,) index of the domain
+    cell: NDArray[np.int64]  # (m,) lexicographic number of the cell
+    fraction: NDArray[np.float64]  # (m,) volume of the piece / volume of the domain
+    x: NDArray[np.float64]  # (m, d) centroid, m
+    # (m, d, 2) on request, else (m, 0, 2): area on the lower and upper face of the cell along each axis, m^(d-1)
     faces: NDArray[np.float64]
+    # (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2
     mixed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    # (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
+    # product of the components of this offset, m^2; radius of this centroid, m
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    # (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces
+    # with symmetric sections
     second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -598,19 +594,20 @@ def _polygons(
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
+    near = grid.snap.max()  # within which corners lie on planes
     two = slice(-3, -1)  # two barycentric coordinates, from which areas are computed
     middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
     order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
     v, group = v[:, order], group[order]
     after = _around(group)
-    distinct = np.abs(v[two, after] - v[two]).max(axis=0) > SLIVER
+    distinct = np.abs(v[two, after] - v[two]).max(axis=0) > near
     v, group = v[:, distinct], group[distinct]
     after = _around(group)
     before = np.empty_like(after)
     before[after] = np.arange(len(after))
     a, b = v[two] - v[two, before], v[two, after] - v[two]
     bend = np.abs(a[0] * b[1] - a[1] * b[0])
-    corner = bend > SLIVER * (np.linalg.norm(a, axis=0) + np.linalg.norm(b, axis=0))
+    corner = bend > near * (np.linalg.norm(a, axis=0) + np.linalg.norm(b, axis=0))
     v, group = v[:, corner], group[corner]
     after, sides = _around(group), np.bincount(group, minlength=len(first))
     middle = np.stack([sum_by(group, x, len(first)) for x in v]) / np.maximum(sides, 1)

@@ -118,6 +118,8 @@ class MaterialPoints:
     origin: NDArray[np.float64]
     reference: NDArray[np.float64]
     data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    INTERNAL = (ACROSS, "owed", "due", "softness")
+    """Names of data that only the method needs."""
 
     def __post_init__(self):
         object.__setattr__(self, "data", MappingProxyType(dict(self.data)))

@@ -22,14 +22,11 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Connected parts of the bodies on the grid.
+    """Connected parts of the bodies on the grid."""
 
-    count: number of parts; cells, nodes (n,): part of each active local cell and node, from 0, else -1.
-    """
-
-    count: int
-    cells: NDArray[np.int64]
-    nodes: NDArray[np.int64]
+    count: int  # number of parts
+    cells: NDArray[np.int64]  # part of each active local cell, from 0, else -1
+    nodes: NDArray[np.int64]  # part of each active local node, from 0, else -1
 
 
 @dataclass(frozen=True, eq=False)

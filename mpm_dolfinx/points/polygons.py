@@ -14,15 +14,11 @@ NONE = -1
 
 @dataclass(frozen=True)
 class Polygons:
-    """n polygons of up to k vertices, anti-clockwise.
+    """n polygons of up to k vertices, anti-clockwise."""
 
-    x (n, k, 2): vertices, m, padded by the last vertex; count (n,): number of vertices.
-    edge (n, k): number of the edge from each vertex to the next; cuts preserve it.
-    """
-
-    x: NDArray[np.float64]
-    count: NDArray[np.int64]
-    edge: NDArray[np.int64]
+    x: NDArray[np.float64]  # (n, k, 2) vertices, m, padded by the last vertex
+    count: NDArray[np.int64]  # (n,) number of vertices
+    edge: NDArray[np.int64]  # (n, k) number of the edge from each vertex to the next; cuts preserve it
 
     @classmethod
     def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:

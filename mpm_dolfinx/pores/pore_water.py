@@ -25,19 +25,15 @@ MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (
 
 @dataclass(frozen=True)
 class PoreWater:
-    """Water storage of m pieces in n cells.
+    """Water storage of m pieces of particle domains in n cells."""
 
-    saturation: function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and maybe more.
-    slot (m,): cell of each piece; store (m,), m^d/Pa: storage; pores (m,), m^d: pore volume; bulk: fluid's, Pa.
-    scale (n,), Pa: suction at which the pores of a cell drain.
-    """
-
+    # function of pressures (m,), Pa: S, dS/dp (m,), 1/Pa, and maybe more
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
-    slot: NDArray[np.int64]
-    store: NDArray[np.float64]
-    pores: NDArray[np.float64]
-    bulk: float
-    scale: NDArray[np.float64]
+    slot: NDArray[np.int64]  # (m,) cell of each piece
+    store: NDArray[np.float64]  # (m,) storage, m^d/Pa
+    pores: NDArray[np.float64]  # (m,) pore volume, m^d
+    bulk: float  # fluid's bulk modulus, Pa
+    scale: NDArray[np.float64]  # (n,) suction at which the pores of a cell drain, Pa
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (S - 1) rho of the pieces, and its derivative, 1/Pa, at pressures p (m,), Pa."""

@@ -23,17 +23,13 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """m tracked material particles.
+    """m tracked material particles."""
 
-    x0 (m, d): reference positions, m; id (m,): particle domain of each probe; xi (m, d): local coordinates in it.
-    bodies: bodies of the scene; stressed: whether stresses are recorded too.
-    """
-
-    x0: NDArray[np.float64]
-    id: NDArray[np.int64]
-    xi: NDArray[np.float64]
-    bodies: tuple[Body, ...] = ()
-    stressed: bool = False
+    x0: NDArray[np.float64]  # (m, d) reference positions, m
+    id: NDArray[np.int64]  # (m,) particle domain of each probe
+    xi: NDArray[np.float64]  # (m, d) local coordinates in this domain
+    bodies: tuple[Body, ...] = ()  # of the scene
+    stressed: bool = False  # whether stresses are recorded too
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
         """Raise ValueError if the scene has other bodies, or if a probe is in an absent body."""

@@ -37,20 +37,20 @@ class Simulated(Protocol):
 
 
 class Step(NamedTuple):
-    """A completed step: state at the start, length, s, and substeps if they differ from the scene's."""
+    """A completed step."""
 
-    start: State
-    dt: float
-    how: tuple
+    start: State  # state at the start
+    dt: float  # length of the step, s
+    how: tuple  # substeps, if they differ from the scene's
 
 
 class Found(NamedTuple):
-    """An event: index of its function, time from the start of the step, s, state and report at the event."""
+    """An event within a step."""
 
-    number: int
-    dt: float
-    new: State
-    report: Report
+    number: int  # index of its function
+    dt: float  # time from the start of the step, s
+    new: State  # state at the event
+    report: Report  # of the step to the event
 
 
 class Events:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import Report, StepFailed, raise_interrupt
-from mpm_dolfinx.base.validation import instance, numbers
+from mpm_dolfinx.base.validation import instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
@@ -213,7 +213,18 @@ class Simulation:
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return results of conditions, also of user-defined ones, at the end of the last step, by name."""
+        """Return results of conditions, also of user-defined ones, at the end of the last step, by name.
+
+        The result is empty for quantities that no condition of the stage has.
+
+        Raises
+        ------
+        KeyError
+            The quantity is unknown; the message lists the known quantities.
+        """
+        known = dict.fromkeys([*self.state.stage.quantities, *self.state.outcome])
+        if quantity not in known:
+            raise KeyError(f"outcome: quantity = {line(quantity)}, must be one of {', '.join(known)}")
         return ByName(self.state.outcome.get(quantity, {}))
 
     @property

@@ -21,11 +21,11 @@ from mpm_dolfinx.stepping.state import State
 
 @dataclass(frozen=True)
 class Part:
-    """A term or solver: name, whether the scene has it, and its form or the reason for its absence."""
+    """A term or solver of a scene."""
 
     name: str
-    used: bool
-    why: str
+    used: bool  # whether the scene has it
+    why: str  # its form, or the reason for its absence
 
 
 def parts(scene: Scene, state: State) -> list[Part]:

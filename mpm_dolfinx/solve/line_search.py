@@ -60,18 +60,14 @@ class Halving:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step at whose end the residuals do less than half of their initial work.
+    """Search for a step at whose end the residuals do less than half of their initial work."""
 
-    step: next trial, as a fraction of the full step; low, high: steps between which the work changes its sign.
-    at_low, at_high: work there / initial work; ends: whether the next step is the last trial.
-    """
-
-    step: float = 1.0
-    low: float = 0.0
-    at_low: float = 1.0
+    step: float = 1.0  # next trial, as a fraction of the full step
+    low: float = 0.0  # steps between which the work changes its sign, as `high`
+    at_low: float = 1.0  # work at `low` / initial work
     high: float = np.inf
-    at_high: float = np.nan
-    ends: bool = False
+    at_high: float = np.nan  # work at `high` / initial work
+    ends: bool = False  # whether the next step is the last trial
     limit = sys.float_info.max
     """Largest growth of the residual at the end of a step."""
 

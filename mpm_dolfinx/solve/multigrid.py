@@ -139,9 +139,7 @@ def interpolation(
     number, owned = _shared(comm, keys, int(np.prod(shape)), stated)
     column = number[at[: len(coarse)]]
     kept = column != NONE
-    rows = rows[kept]
-    column = column[kept]
-    weights = weights[kept]
+    rows, column, weights = (values[kept] for values in (rows, column, weights))
     if not nodal:
         weights = weights / np.bincount(rows, weights, len(places))[rows]
     Q = scipy.sparse.coo_matrix((weights, (rows, column)), shape=(len(places), column.max(initial=-1) + 1)).tocsr()

@@ -78,18 +78,14 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,).
+    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,)."""
 
-    u, p: relative residuals of momentum and storage; forces: scale of u, N; exchanged: scale of p, m^d, the exchanged
-    fluid volume; start: forces at the start of the step, N; fluid: residual of the storage, or None.
-    """
-
-    u: NDArray[np.float64]
-    p: NDArray[np.float64]
-    forces: NDArray[np.float64]
-    exchanged: NDArray[np.float64]
-    start: NDArray[np.float64]
-    fluid: StorageResidual | None
+    u: NDArray[np.float64]  # relative residual of momentum
+    p: NDArray[np.float64]  # relative residual of storage
+    forces: NDArray[np.float64]  # scale of u, N
+    exchanged: NDArray[np.float64]  # scale of p: exchanged fluid volume, m^d
+    start: NDArray[np.float64]  # forces at the start of the step, N
+    fluid: StorageResidual | None  # residual of the storage, or None
 
     @cached_property
     def each(self) -> NDArray[np.float64]:
@@ -458,19 +454,21 @@ class Newton:
         """Move u and p against the direction; the line search sets the step length of each part; return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        first = np.full(of.count, np.nan) if elastic else self._work()  # without yield it is not used
-        if (first < 0).any():
+        moved = np.zeros(of.count)
+        steps = moved + 1.0
+        first = moved if elastic else self._work()  # without yield it is not used
+        if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
         start = Halving() if elastic else Search()
         searches = dict.fromkeys((before.each > self._scheme.tolerance).nonzero()[0], start)
-        steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
             growth, work = errors.each / before.each, first if elastic else self._work()
             for part, search in list(searches.items()):
-                then = search.after(np.nan if why else _ratio(work[part], first[part]), growth[part])
+                ratio = np.nan if why or elastic else _ratio(work[part], first[part])
+                then = search.after(ratio, growth[part])
                 if then is not None:
                     searches[part], steps[part] = then, then.step
                 elif growth[part] <= search.limit:

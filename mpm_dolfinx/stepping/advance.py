@@ -20,7 +20,8 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
-from mpm_dolfinx.domains.lattice import filtered, given
+from mpm_dolfinx.domains.kept_volumes import with_volumes
+from mpm_dolfinx.domains.lattice import filtered, given, seeded, stopped
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.forms.point_forms import PointData
@@ -142,6 +143,8 @@ class Motion:
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
+            if cut.domains and self._materials.evolves:
+                points = self._corrected(points, state, loads, keeps)
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
@@ -198,16 +201,11 @@ class Motion:
         volume, *sums = sum_by(places.slots, rows, len(places.filled))
         of_cells = np.reshape(sums, (d, 1 + d, -1)).transpose(2, 0, 1)
         x = grid.node_x[grid.cell_nodes[places.filled]]
-        whole = self._momentum.at_nodes(places.filled, volume)[:, None]
         moved = of_cells[:, None, :, 0] + x @ of_cells[:, :, 1:].swapaxes(1, 2)
-        dofs, at = places.dofs
-
-        def add(out: NDArray[np.float64]) -> None:
-            out[dofs] += sum_by(at, moved.ravel(), len(dofs))
-
-        total, nodes = self._momentum.summed(0, [add]), self._momentum.active.now.nodes
-        out = np.zeros((len(total) // d, d))
-        out[nodes] = total.reshape(-1, d)[nodes] / np.where(whole > 0, whole, 1.0)
+        total, nodes = partial(self._momentum.at_nodes, places.filled), self._momentum.active.now.nodes
+        whole, out = total(volume), np.zeros((len(grid.node_x), d))
+        for axis in range(d):
+            out[nodes, axis] = total(moved[:, :, axis]) / np.where(whole > 0, whole, 1.0)
         return out.ravel()
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
@@ -335,6 +333,26 @@ class Motion:
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
+
+    def _corrected(
+        self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
+    ) -> MaterialPoints:
+        """Return the points with corrected corners of yielded domains that leave their cut, not in keeps (n,)."""
+        grid, stage = self._momentum.grid, state.stage
+        yielded = self._materials.evolved(points) & ~keeps
+        if not over_all(grid.comm, int(yielded.sum())):
+            return points
+        number, held = seeded(stage.lattices, points)
+        for one in loads:
+            held |= one.near(state.points, points.corners)
+        walls = stage.conditions["walls"]
+        own = ~given(grid, stage.lattices, walls, points)
+        domains = points.id, points.corners, points.volume0 * points.J, yielded, own & ~held[:, :, None]
+        corners = with_volumes(grid, *domains, self._body(points), number)
+        corners[yielded] = stopped(grid, walls, corners[yielded], points.corners[yielded])
+        for one in loads:
+            corners = one.outside(corners, own)
+        return replace(points, corners=corners, x=centroids(corners))
 
     def _volume_defect(
         self,

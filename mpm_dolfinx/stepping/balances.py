@@ -27,28 +27,25 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Acting(NamedTuple):
-    """Loads of a substep; substep: time weights; t: end of the substep, s; gravity (d,), m/s^2, or None."""
+    """Loads of a substep."""
 
-    substep: Substep
-    t: float
+    substep: Substep  # its time weights
+    t: float  # time at its end, s
     loads: Sequence[Loads]
-    gravity: NDArray[np.float64] | None
+    gravity: NDArray[np.float64] | None  # (d,), m/s^2
 
 
 class Start(NamedTuple):
-    """Start of a step of dt, s: the state on the grid, with integration points, matrices and loads.
-
-    yielded: whether soil has yielded before, on any process; renewed: number of renewed particle domains.
-    """
+    """Start of a step: the state on the grid, with integration points, matrices and loads."""
 
     state: State
     on_grid: OnGrid
     data: QuadratureData
     matrices: Assembled
-    dt: float
-    yielded: bool
-    acting: list[Acting]
-    renewed: int = 0
+    dt: float  # length of the step, s
+    yielded: bool  # whether soil has yielded before, on any process
+    acting: list[Acting]  # loads of each substep
+    renewed: int = 0  # number of renewed particle domains
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
         """Return the loads at the beginning of a substep; earlier: their data from the previous substep."""

@@ -27,7 +27,7 @@ from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
-from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets
+from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets, off_middle
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.grid.grid import sum_by
@@ -539,7 +539,7 @@ class Assembled(Keyed):
             self.storage.set_alternation()
             if (form := storage.fluxes.nonorthogonal) is not None:
                 self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
-        self._gradients: Latest[Gradients] = Latest()
+        self._gradients: Latest[Gradients | None] = Latest()
 
     @property
     def solvers(self) -> LinearSolvers:
@@ -598,8 +598,13 @@ class Assembled(Keyed):
 
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
-            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
+            gradients = None if self._off is None else self._gradients(where, fit)
+            off = gradients and (self._off, gradients, sides)
             return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
+
+        def fit() -> Gradients | None:
+            needed = self._off.some or off_middle(sides, grid).any()
+            return Gradients(contents, sides) if needed else None
 
         mixture = ()
         if self._by_pressure is not None:

@@ -74,6 +74,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         raise ValueError(
             f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
         )
+    _check_weight(first, None, 0.0)
+    scene.check_followed(first)
     comm, gravity = scene.grid.comm, first.conditions["gravity"]
     warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
     if scene.fluid and scene.materials.conducts:
@@ -118,6 +120,7 @@ def begin_stage(
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
     after = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    _check_weight(after, before, state.t)
     if "gravity" in named or waters(after.given) != waters(before.given):
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
@@ -158,7 +161,8 @@ def begin_stage(
         points = replace(points, origin=points.corners)
     outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(after, before) else None
-    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest, "trend": None}
+    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    new["trend"] = None if add or remove else state.trend
     return replace(state, points=points, pieces=pieces, **new)
 
 
@@ -223,6 +227,18 @@ def _holds_as(after: Stage, before: Stage) -> bool:
         hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
         for (hold, faces, _), (was, then, _) in zip(after.held, before.held, strict=True)
     )
+
+
+def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
+    """Raise ValueError for quiet sides in a stage whose weight differs from before: their traction does not bear it."""
+    quiet = after.of(Quiet)
+    now = after.gravity_at(t) if quiet else None
+    was = None if before is None else before.gravity_at(t)
+    was = np.zeros(after.free.shape[1]) if was is None else was
+    if now is not None and (now != was).any():
+        what = f"{next(iter(quiet))}: its traction at rest does not bear the weight, gravity = {line(now.tolist())}"
+        allowed = "must begin a stage later: first prescribe the side in a stage without inertia"
+        raise ValueError(f"{what} after {line(was.tolist())}, {allowed}")
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
@@ -423,7 +439,8 @@ def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArr
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
-    place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
+    at = start.on_grid.cut, start.on_grid.fill, state.points, data
+    place = Place(*at, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
     when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
     return scene.balance(when, matrices.momentum, data, loads, 0.0)

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from mpi4py import MPI
 
@@ -17,6 +18,14 @@ from mpm_dolfinx.grid.following import carried, lines_at
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.state import State
+
+
+def followed_tool(grid: Grid, conditions: Mapping[str, Any]) -> str | None:
+    """Return the name of the tool that the lines of a grid follow, among conditions by name; None if it is absent."""
+    for name, one in conditions.items():
+        if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
+            return name
+    return None
 
 
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
@@ -50,11 +59,10 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
     """Return the coordinates (n,), m, of the grid lines along each axis for a state, relative to the base."""
     if hasattr(grid.follow, "pose"):
-        for name, one in state.stage.given.items():
-            if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
-                shift = one.pose(state.t, grid.dim, state.outcome["tool_travel"][name]).shift
-                return carried(grid.seeded, shift)
-        return before
+        if (name := followed_tool(grid, state.stage.given)) is None:
+            return before
+        tool, travel = state.stage.given[name], state.outcome["tool_travel"][name]
+        return carried(grid.seeded, tool.pose(state.t, grid.dim, travel).shift)
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
     lines = grid.from_base(
         lines_at(grid.follow, [x + start for x, start in zip(grid.seeded, grid.base, strict=True)], state.t, x)

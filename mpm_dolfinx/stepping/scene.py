@@ -39,23 +39,20 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
-from mpm_dolfinx.stepping.moving_lines import with_lines
+from mpm_dolfinx.stepping.moving_lines import followed_tool, with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 
 class When(NamedTuple):
-    """A substep: time at its end, s; time since the start of the step, s; gravity (d,), m/s^2, or None.
+    """A substep."""
 
-    own: weight of the rate at its end, s; past: fraction of the displacement at its start, see `Velocity`.
-    """
-
-    t: float
-    since: float
-    gravity: NDArray[np.float64] | None
-    own: float
-    past: float
+    t: float  # time at its end, s
+    since: float  # time since the start of the step, s
+    gravity: NDArray[np.float64] | None  # (d,), m/s^2
+    own: float  # weight of the rate at its end, s
+    past: float  # fraction of the displacement at its start, see `Velocity`
 
 
 class Scene:
@@ -221,6 +218,12 @@ class Scene:
 
         lines = () if grid.follow is None else grid.lines
         return self._on_grid((points.arrays, lines), make, grid.comm)
+
+    def check_followed(self, first: Stage) -> None:
+        """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
+        follow = self.grid.follow
+        if hasattr(follow, "pose") and followed_tool(self.grid, first.given) is None:
+            raise ValueError(f"grid: follow = {line(follow)}: not in the first stage, must be in its conditions")
 
     def followed(self, state: State) -> State:
         """Return the state for its next step, and move the grid to the lines of that step."""

@@ -14,7 +14,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.validation import all_of, check_names, given, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
+from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES, Acting, Loads, Outcome, Place, Setting
 from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
@@ -82,25 +82,19 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The conditions of a stage.
+    """The conditions of a stage."""
 
-    given: conditions by name, as given; named: the same, with the unit weight of water of the pore fluid.
-    conditions: walls, with the axis, and gravity; present: whether each body is present; later: bodies to be added.
-    free (nodes, d): whether walls leave each component free; axisymmetric: see `Grid`; materials: the scene's.
-    lattices: of present bodies; acting: loads in the balance of momentum; feeding: terms in the balance of fluid.
-    """
-
-    given: Mapping[str, Condition]
-    named: Mapping[str, Condition]
-    conditions: Mapping[str, Any]
-    present: tuple[bool, ...]
-    later: tuple[int, ...]
-    free: NDArray[np.bool_]
-    axisymmetric: bool
-    lattices: Sequence[Lattice]
-    materials: SceneMaterials
-    acting: tuple[Acting, ...]
-    feeding: tuple[Feeding, ...]
+    given: Mapping[str, Condition]  # conditions by name, as given
+    named: Mapping[str, Condition]  # the same, with the unit weight of water of the pore fluid
+    conditions: Mapping[str, Any]  # walls, with the axis, and gravity
+    present: tuple[bool, ...]  # whether each body is present
+    later: tuple[int, ...]  # indices of bodies to be added
+    free: NDArray[np.bool_]  # (nodes, d) whether walls leave each component free
+    axisymmetric: bool  # see `Grid`
+    lattices: Sequence[Lattice]  # of present bodies
+    materials: SceneMaterials  # of the scene
+    acting: tuple[Acting, ...]  # loads in the balance of momentum
+    feeding: tuple[Feeding, ...]  # terms in the balance of fluid
 
     @property
     def inertia(self) -> bool:
@@ -153,6 +147,11 @@ class Stage:
         """Return the names of conditions that are unchanged from the previous stage, or have their own name."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Quantities that conditions of the package may return."""
+        return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return results of conditions, by quantity and name, all equal to `value`, before the first step."""
@@ -229,8 +228,9 @@ def stage(
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
-    if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
-        raise ValueError("conditions: drained or inflow sides without fluid, must be in a scene with fluid")
+    for name, one in by_name.items():
+        if fluid is None and (isinstance(one, wet) or hasattr(one, "feeding")):
+            raise ValueError(f"{name}: {line(one)}, must be in a scene with fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):

@@ -113,8 +113,7 @@ class State:
         Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
         or contact. None before the first step, and without yield or contact.
     trend
-        Motion in the last steps: an initial guess in dry elastic bodies. None before the first step of a stage, and in
-        other scenes.
+        Motion in the last steps, an initial guess in dry elastic bodies; None else, at first and after other bodies.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
         forces, after a new stage, and after a reset of the grid.

@@ -88,19 +88,16 @@ class Space:
 
 
 class Forms(NamedTuple):
-    """Compiled residual, tangent, flux and loads, and their constants.
-
-    dt, since, t: time weight of the flux, time since the start of the step, and time at the end of the substep, s.
-    given: functions of time, each with the constant of its value.
-    """
+    """Compiled residual, tangent, flux and loads, and their constants."""
 
     residual: Any
     tangent: Any
     flux: Any | None
     load: Any | None
-    dt: fem.Constant
-    since: fem.Constant
-    t: fem.Constant
+    dt: fem.Constant  # time weight of the flux, s
+    since: fem.Constant  # time since the start of the step, s
+    t: fem.Constant  # time at the end of the substep, s
+    # functions of time, each with the constant of its value
     given: list[tuple[Callable[[float], ArrayLike], fem.Constant]]
 
 

@@ -61,18 +61,14 @@ class _Rings:
 
 @dataclass(frozen=True)
 class Cavity:
-    """A thick cylinder of soil in plane strain, with linear elements of one point each, under two pressures.
+    """A thick cylinder of soil in plane strain, with linear elements of one point each, under two pressures."""
 
-    rings: law; R, r: initial and present radii of the nodes, m; state: state of the law.
-    far: pressure at the outer radius, Pa; pressure: pressure at the cavity wall, Pa.
-    """
-
-    rings: _Rings
-    R: NDArray[np.float64]
-    r: NDArray[np.float64]
-    state: State
-    far: float
-    pressure: float
+    rings: _Rings  # law
+    R: NDArray[np.float64]  # initial radii of the nodes, m
+    r: NDArray[np.float64]  # present radii of the nodes, m
+    state: State  # state of the law
+    far: float  # pressure at the outer radius, Pa
+    pressure: float  # pressure at the cavity wall, Pa
 
     def widened(self, radius: float) -> Cavity:
         """Return the cylinder after drained expansion of the cavity to a radius, m, in one step."""

@@ -173,12 +173,12 @@ def _not_negative(v) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _At:
-    """State of the sample: F (3, 3), effective Cauchy stress (3, 3), Pa, strain as in `ElementTest`, law's state."""
+    """State of the sample."""
 
-    F: NDArray[np.float64]
-    stress: NDArray[np.float64]
-    strain: float
-    state: dict[str, NDArray[np.float64]]
+    F: NDArray[np.float64]  # (3, 3)
+    stress: NDArray[np.float64]  # effective Cauchy stress (3, 3), Pa
+    strain: float  # as in `ElementTest`
+    state: dict[str, NDArray[np.float64]]  # state variables of the law
 
 
 class _Point:

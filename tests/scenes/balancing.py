@@ -128,7 +128,12 @@ class Ledger:
                 self._count_forces(built)
             if built.scene.fluid is not None:
                 self._count_fluid(built)
-        self._before, held = _owed(built), simulation.state.held
+        self._before = _owed(built)
+        self.begun(built)
+
+    def begun(self, built: Built) -> None:
+        """Note the forces that hold the state at rest; a stage may end them."""
+        held = built.simulation.state.held
         self._held = 0.0 if held is None else held.reshape(-1, built.scene.dim).sum(axis=0)
 
     def _count_forces(self, built: Built) -> None:

@@ -69,6 +69,8 @@ def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
     if "rain" in found:
         found["rain"] = max(found["rain"], found["outflows"] * scene.end)
     found["travel"] = max(found["travel"], LEAST * h)
+    if "rotation" in found:
+        found["rotation"] = max(found["rotation"], LEAST)
     return found
 
 

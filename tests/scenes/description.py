@@ -41,9 +41,10 @@ class Block:
 class Condition:
     """A condition on a side.
 
-    kind: "traction", "normal", "pressure", "displacement", "plate", "drained", "seepage", "inflow", "rain", "springs";
-    value: along the axes, or one number, of rain its flux, m/s, and pressures of its pond and of air, Pa; it grows
-    until the time `ramp`, s, if that is not 0; components: that are given; region: box of reference positions, m.
+    kind: "traction", "normal", "pressure", "displacement", "plate", "drained", "seepage", "inflow", "rain", "springs",
+    "quiet", "tied"; value: along the axes, or one number, of rain its flux, m/s, and pressures of its pond and of air,
+    Pa; it grows until the time `ramp`, s, if that is not 0; components: that are given; region: box of reference
+    positions, m.
     """
 
     kind: str
@@ -56,7 +57,10 @@ class Condition:
 
 @dataclass(frozen=True)
 class RigidTool:
-    """A tool: shape "ball", "plate" or "wedge" at a place, m; travel, m, until `ramp`, s, or a load, N, along it."""
+    """A tool: shape "ball", "plate" or "wedge" at a place, m; travel, m, until `ramp`, s, or a load, N, along it.
+
+    mass: of a free tool, kg/m, that flies with the velocity travel / ramp and turns with a spin, 1/s.
+    """
 
     shape: str
     place: Vector
@@ -66,6 +70,9 @@ class RigidTool:
     friction: float = 0.0
     adhesion: float = 0.0
     load: float = 0.0
+    mass: float = 0.0
+    moment: float = 0.0
+    spin: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,8 @@ class Scene:
     cells, h : (d,), -, m — of the grid, which begins at the origin; materials: name of the law, its constants;
     initial: stress at rest, None or "K0" or "given", with `ratio` and `surcharge`, Pa; level: of the water table, m;
     contact: friction between the last body and the others; rate: of a source, 1/s; stiffness: of springs in the bodies,
-    N/m^4; uneven: whether grid lines lie at random; renewal: whether domains of yielded soil are renewed.
+    N/m^4; uneven: whether grid lines lie at random; renewal: whether domains of yielded soil are renewed;
+    follows: whether grid lines follow the first tool; inertia: whether bodies have it.
     """
 
     seed: int
@@ -112,6 +120,8 @@ class Scene:
     tolerance: float = 1e-11
     uneven: bool = False
     renewal: bool = False
+    follows: bool = False
+    inertia: bool = False
 
     @property
     def dim(self) -> int:
@@ -127,6 +137,10 @@ class Scene:
         if not self.uneven:
             return [h * np.arange(n + 1) for n, h in zip(self.cells, self.h, strict=True)]
         rng, out = np.random.default_rng(self.seed), []
+        if self.follows:  # fine about the middle, where lines are carried along
+            wide = (1 + 0.5 * np.abs(np.arange(n) - (n - 1) / 2) for n in self.cells)
+            of = (np.append(0.0, np.cumsum(width)) for width in wide)
+            return [size * x / x[-1] for x, size in zip(of, self.size, strict=True)]
         for n, size in zip(self.cells, self.size, strict=True):
             x = np.append(0.0, np.cumsum(rng.uniform(1, 3, n)))
             out.append(size * x / x[-1])
@@ -147,7 +161,8 @@ class Scene:
             "dry" if self.fluid is None else "wet",
             conditions,
             *(
-                f"tool {t.shape}{' pushed' if t.load else ''}{' rough' if t.friction + t.adhesion else ''}"
+                f"tool {t.shape}{' pushed' if t.load else ' free' if t.mass else ''}"
+                + (" rough" if t.friction + t.adhesion else "")
                 for t in self.tools
             ),
             f"contact {self.contact:.1g}" if self.contact is not None else "",
@@ -155,6 +170,8 @@ class Scene:
             "+".join(law["retention"][0] for _, law in self.materials if law.get("retention")),
             "source" if self.rate else "",
             "springs" if self.stiffness else "",
+            "inertia" if self.inertia else "",
+            "lines follow" if self.follows else "",
             self.method if self.method != "sdirk2" else "",
             f"rtol {self.rtol:g}" if self.rtol else "",
             f"stage {self.stage.kind}" if self.stage else "",
@@ -301,6 +318,56 @@ def draining(seed: int, **given) -> Scene:
     return scene.with_(
         conditions=(*kept, Condition("rain", "top", rain, scene.end * draw.one(0.0, 0.6), region=region))
     )
+
+
+def newer(seed: int, **given) -> Scene:
+    """Return the scene of a seed in 2D with inertia, quiet or tied sides, a free tool, or lines that follow a tool."""
+    scene, draw = drawn(seed, dim=2, axisymmetric=False, **given), Draw([seed, 5])
+    while scene.contact is not None:
+        scene = drawn(draw.whole(0, 10**6), dim=2, axisymmetric=False, **given).with_(seed=seed)
+    kind = draw.one("inertia", "quiet", "tied", "free", "follow")
+    scene = scene.with_(stage=None, rtol=None, initial=None, surcharge=0.0, level=None, method="sdirk2")
+    if kind in ("inertia", "quiet", "free") or (kind == "tied" and draw.yes(0.5)):
+        scene = _moving(draw, scene)
+    if kind == "quiet":
+        side, walls = "right" if "right" not in scene.walls else "bottom", dict(scene.walls)
+        if side == "bottom":
+            del walls["bottom"]
+            up = np.array([0.0, 0.4 * scene.h[1]])  # off the grid's edge
+            raised = (replace(b, lower=tuple(b.lower + up), upper=tuple(b.upper + up)) for b in scene.bodies)
+            tools = (replace(t, place=tuple(t.place + up)) for t in scene.tools)
+            scene = scene.with_(gravity=0.0, bodies=tuple(raised), tools=tuple(tools))
+        kept = [c for c in scene.conditions if c.side != side]
+        return scene.with_(walls=walls, conditions=(*kept, Condition("quiet", side, ())))
+    if kind == "tied":
+        low, high = 0.7 * scene.h[0], scene.size[0] - 0.8 * scene.h[0]
+        blocks = (replace(b, slant=0.0, kind="box") for b in scene.bodies)
+        bodies = tuple(replace(b, lower=(low, b.lower[1]), upper=(high, b.upper[1])) for b in blocks)
+        kept = [c for c in scene.conditions if c.side not in ("left", "right")]
+        tied = Condition("tied", "left", ())
+        return scene.with_(bodies=bodies, walls={"bottom": "xy"}, conditions=(*kept, tied))
+    if kind in ("free", "follow"):
+        flat = tuple(replace(b, slant=0.0) for b in scene.bodies)
+        kept = tuple(c for c in scene.conditions if c.side != "top" or c.kind in ("drained", "seepage", "inflow"))
+        scene = scene.with_(bodies=flat, conditions=kept)
+        push, ramp = draw.between(0.02, 0.15) * scene.h[-1], scene.end * draw.one(0.3, 1.0)
+        tool = replace(_tool(draw, scene, push, ramp, draw.order(3.3, 4.3)), load=0.0)
+        if kind == "follow":
+            return scene.with_(tools=(tool,), uneven=True, follows=True)
+        mass = draw.between(0.3, 3.0) * 2000 * tool.size**2
+        spins = {"moment": mass * (tool.size / draw.between(1.0, 3.0)) ** 2, "spin": draw.between(-1, 1) / scene.end}
+        return scene.with_(tools=(replace(tool, shape="ball", mass=mass, **spins),))
+    return scene
+
+
+def _moving(draw: Draw, scene: Scene) -> Scene:
+    """Return the scene with inertia, in which waves pass it a few times."""
+    slowest = min(np.sqrt(law["shear"] / law["grain_density"]) for _, law in scene.materials)
+    end = draw.between(0.5, 2.0) * scene.size[-1] / slowest
+    ramped = (replace(c, ramp=c.ramp / scene.end * end) for c in scene.conditions)
+    tools = (replace(t, ramp=t.ramp / scene.end * end) for t in scene.tools)
+    changes = {"conditions": tuple(ramped), "tools": tuple(tools), "end": float(end), "steps": draw.whole(3, 5)}
+    return scene.with_(inertia=True, **changes)
 
 
 def _retention(draw: Draw) -> tuple[str, dict[str, float]]:

@@ -105,6 +105,15 @@ class Frame:
         plane = scene.dim == 2 and not scene.axisymmetric
         return self.length ** (2 if plane else 3) / self.time
 
+    @property
+    def turn(self) -> float:
+        """Return the factor of angles in the plane: -1 where left and right change places."""
+        return float(np.linalg.det(np.eye(self.dim)[list(self.axes)] * self.signs))
+
+    def mass(self, scene: Scene) -> float:
+        """Return the factor of masses of tools."""
+        return self.force(scene) * self.time**2 / self.length
+
     # ---- which there are --------------------------------------------------------------------
 
     def named(self) -> dict[str, Frame]:
@@ -153,8 +162,11 @@ def turns(scene: Scene) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
 def bears_far(scene: Scene) -> bool:
     """Return whether a far body leaves a scene alone.
 
-    Sources feed it, tools reach it, steps by error see it, and an initial stress is brought into balance with it.
+    Sources feed it, tools reach it, steps by error see it, an initial stress is brought into balance with it, and sides
+    are tied to its own.
     """
+    if any(c.kind == "tied" for c in scene.conditions):
+        return False
     return not scene.rate and not scene.tools and scene.rtol is None and scene.initial is None
 
 

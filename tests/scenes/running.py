@@ -71,7 +71,8 @@ class _Builder:
             for along, axis in zip(x, frame.axes, strict=True):
                 along[:, axis] = lines[axis]
             lines = [np.sort(frame.place(along, scene)[:, k]) for k, along in enumerate(x)]
-            self.grid = mpm.Grid(lines=lines, axisymmetric=scene.axisymmetric)
+            follow = {"follow": self.tool(scene.tools[0])} if scene.follows else {}
+            self.grid = mpm.Grid(lines=lines, axisymmetric=scene.axisymmetric, **follow)
         bodies = self.permuted(list(range(len(scene.bodies) + far)))
         laws = self.permuted(list(range(len(scene.materials) + far)))
         self.order = [bodies.index(i) for i in range(len(bodies))]
@@ -179,7 +180,18 @@ class _Builder:
     # ---- conditions -------------------------------------------------------------------------
 
     def conditions(self) -> dict[str, list]:
-        names = ("tractions", "displacements", "plates", "drained", "inflows", "tools", "contacts", "terms", "sources")
+        names = (
+            "tractions",
+            "displacements",
+            "plates",
+            "drained",
+            "inflows",
+            "tools",
+            "contacts",
+            "terms",
+            "sources",
+            "others",
+        )
         out = {name: [] for name in names}
         kinds = {
             "traction": "tractions",
@@ -194,10 +206,14 @@ class _Builder:
             "inflow": "inflows",
             "rain": "inflows",
             "springs": "terms",
+            "quiet": "others",
+            "tied": "others",
         }
         for condition in self.scene.conditions:
             out[kinds[condition.kind]].append(self.condition(condition))
         out["tools"] = [self.tool(tool) for tool in self.scene.tools]
+        if self.scene.follows:  # the one that the lines follow
+            out["tools"][0] = self.grid.follow
         if self.scene.contact is not None:
             last = self.order[len(self.scene.bodies) - 1]
             others = [i for k, i in enumerate(self.order) if k != len(self.scene.bodies) - 1]
@@ -236,6 +252,10 @@ class _Builder:
     def condition(self, c: Condition):
         frame, scene = self.frame, self.scene
         side, region = frame.side(c.side), self.region(c)
+        if c.kind == "tied":
+            return mpm.Tied(side, frame.side("right"))
+        if c.kind == "quiet":
+            return mpm.Quiet(side, region=region)
         if c.kind == "traction":
             return mpm.Traction(side, self.traction(c.value, c.ramp), region=region)
         if c.kind == "normal":
@@ -281,6 +301,11 @@ class _Builder:
         else:
             shape = mpm.Cone(frame.place(place, scene), frame.vector(up), 65.0)
         own = {"friction": tool.friction, "adhesion": tool.adhesion * frame.stress}
+        if tool.mass:
+            way = frame.length * frame.vector(tool.travel) / tool.ramp / frame.time * frame.load
+            own |= {"mass": tool.mass * frame.mass(scene), "moment": tool.moment * frame.mass(scene) * frame.length**2}
+            own |= {"velocity": tuple(way), "spin": frame.turn * tool.spin / frame.time}
+            return mpm.Tool(shape, centre=frame.place(place + tool.size * up, scene), **own)
         travel = self.grown(frame.length * frame.vector(tool.travel), tool.ramp)
         if not tool.load:
             return mpm.Tool(shape, displacement=travel, centre=frame.place(place, scene), **own)
@@ -298,6 +323,8 @@ class _Builder:
     def options(self, later: list[int]) -> dict:
         scene, frame = self.scene, self.frame
         out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance, renewal=scene.renewal)}
+        if scene.inertia:
+            out["inertia"] = True
         down = np.zeros(scene.dim)
         down[-1] = -scene.gravity * frame.length / frame.time**2
         if scene.gravity:
@@ -377,6 +404,9 @@ def shown(built: Built) -> Shown:
     rows = [*built.own("tools"), *(tools + i for i in built.own("contacts"))]
     fields["tools"] = frame.vector_back(s.tool_forces.array.reshape(-1, 3 * d - 3)[rows, :d] / frame.force(scene))
     fields["travel"] = s.tool_travel.array[built.own("tools")] / frame.length
+    if any(tool.mass for tool in scene.tools):
+        fields["travel"] = frame.vector_back(fields["travel"])
+        fields["rotation"] = s.outcome("tool_rotation").array * frame.turn
     return Shown(frame.place_back(places, scene), fields, s.result.steps)
 
 
@@ -420,8 +450,11 @@ def run(scene: Scene, frame: Frame) -> list[Shown]:
     return out
 
 
-def counted(scene: Scene, count: Callable[[Built], None]) -> None:
-    """Take the steps of a scene as it is, none of which is cut; call a function before the first and after each."""
+def counted(scene: Scene, count: Callable[[Built], None], begun: Callable[[Built], None]) -> None:
+    """Take the steps of a scene as it is, none of which is cut; call a function before the first and after each.
+
+    begun: called once the scene's stage has begun.
+    """
     built, dt = build(scene, Frame.plain(scene.dim)), scene.end / scene.steps
     count(built)
     for _ in range(scene.steps):
@@ -429,5 +462,6 @@ def counted(scene: Scene, count: Callable[[Built], None]) -> None:
         count(built)
     if scene.stage:
         _stage(built)
+        begun(built)
         built.simulation.step(dt)
         count(built)
