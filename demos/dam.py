@@ -10,8 +10,8 @@ are seepage faces.
 Checks:
 
 * `flow`: outflow of a rectangular dam, divided by the exact outflow.  The dam is 9.6 m wide, with water levels of 10 m
-  and 2 m, and hydrostatic suction on its sides above these levels.  The exact flow is k (H1^2 - H2^2) / (2 L) of Dupuit
-  and Charny, with the head replaced by Kirchhoff's potential, the integral of k_r over the head;
+  and 2 m, and hydrostatic suction on its sides above these levels.  The exact flow is k (H1^2 - H2^2) / (2 L) (Dupuit,
+  Charny).  Here Kirchhoff's potential, the integral of k_r over the head, replaces the head;
 * `steady`: inflow of the dam divided by its outflow, before the reservoir falls;
 * `drained`: outflow of a column, divided by the outflow of finite elements on cells of a quarter of the size.  The free
   surface of the column falls from 8 m towards 2 m.

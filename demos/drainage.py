@@ -6,7 +6,7 @@ user-defined.  The effective stress uses chi p, with chi the saturation.  The re
 finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
 
 Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the largest pressure at this
-time; relative errors of the settlement, and of the outflow at the foot.  On one process.
+time.  Errors of the settlement, and of the outflow at the foot, are relative.  On one process.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ def worst(rows: list[Row], name: str) -> float:
 
 
 def table(head: list[str], rows: list[list]) -> str:
-    """Return a Markdown table, with numbers in short form and blanks for missing ones."""
+    """Return a Markdown table, with short numbers, and blanks for missing numbers."""
 
     def cell(v) -> str:
         if isinstance(v, float):

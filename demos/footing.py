@@ -14,7 +14,7 @@ B.
 
 Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c,
 N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Limit loads are computed for very stiff soil, which
-yields before the geometry changes, with --cells cells over the width, and with about twice as many.
+yields before the geometry changes.  Runs use --cells cells over the width, and about twice as many.
 
 For deep penetration the soil does not dilate.  The undrained strength is s_u = xi c.  At depth D the limit load is (1 +
 0.27 sqrt(D/B)) times that at the surface (fit to bounds of limit analysis, Salgado et al. 2004).  The drained limit

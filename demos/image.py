@@ -6,9 +6,9 @@ grid.  `mpm.shape` keeps all pixels that are not black.  The constants of the la
 the grey value.  From black to white, tissue becomes ten times as stiff and less permeable.  A rigid permeable plate
 compresses the tissue between smooth walls by an eighth of its height.  Holes are no-flow.  On one process.
 
-Checks: `modulus` is the drained modulus under a small load, relative to Taylor-Hood elements, with one element for each
-pixel, and a millionth of the stiffness in holes.  `drained` is the final settlement of the saturated tissue, relative
-to dry tissue.  Both errors fall with the size of the pixels.
+Checks: `modulus` is the drained modulus under a small load, relative to Taylor-Hood elements.  These have one element
+for each pixel, and a millionth of the stiffness in holes.  `drained` is the final settlement of the saturated tissue,
+relative to dry tissue.  Both errors fall with the size of the pixels.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ depth d the factor of safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
 
-with the suction stress chi s of Bishop and a constant unit weight gamma.  Before the rain and in steady rain q, the
-suction s in exponential soil is exactly exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), z above
-the water table.
+with the suction stress chi s of Bishop and a constant unit weight gamma.  The suction s in exponential soil is known
+before the rain, and in steady rain q at a height z above the water table: exp(-alpha s / gamma_w) = q / k + (1 - q / k)
+exp(-alpha z cos^2 b).
 
 Source: Lu and Godt (2008) for vertical flow; for flow normal to the slope, gravity is replaced by its normal component.
 Errors: the largest error of FS at 1, 2, 3 and 5 m, before the rain and in steady rain.

@@ -12,15 +12,16 @@ so far.
 
 The exponent of a part is the slope of log(time) against log(points), a least-squares fit to the upper half of the
 sizes. The slope of the memory, `kB a point`, is a fit to all sizes, by least squares of relative errors.  Runs on
-several processes also print `imbalance`, the largest number of pieces of a process divided by the mean, and the traffic
-of a step, the largest of all processes.  `exchange` is the traffic of the package (pieces, corners, points).  `solvers`
-is PETSc's count in set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
+several processes also print `imbalance`, the largest number of pieces of a process divided by the mean.  They print the
+traffic of a step, the largest of all processes.  `exchange` is the traffic of the package (pieces, corners, points).
+`solvers` is PETSc's count in set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not
+counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
 
     T = e + a n / P + b H + c log2 P,
 
-with a fixed cost e, the work a n / P of the points (multiplied by the imbalance of the run), the halo b H, and messages
+e is a fixed cost, a n / P the work of the points (multiplied by the imbalance of the run), b H the halo.  Messages cost
 c log2 P.  All coefficients are >= 0, from least squares of relative errors.  H is the number of points along the faces
 between processes, for a cube that is divided into halves repeatedly.  If a run has more processes than the machine has
 processors, its message counts are used, but not its times.  In 2D the model excludes the solvers, because the cost of

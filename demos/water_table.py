@@ -10,9 +10,9 @@ The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  Th
 days, is constant for two days and falls in two days.  The soil of the levee retains water under suction, so water that
 infiltrates late also drains late.
 
-Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours, and the error
-of the final outflow into the ditch.  `balance`: error of the water balance of the slab, divided by the rain.  On one
-process.
+Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours.  A further
+error is that of the final outflow into the ditch.  `balance`: error of the water balance of the slab, divided by the
+rain.  On one process.
 """
 
 from __future__ import annotations

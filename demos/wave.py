@@ -8,9 +8,9 @@
 2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), slow or
    fast.  Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
    only the top 0.3 m drains, little more than a cell.  The settlement is therefore not compared.
-3. The same column carries a sudden load, with incompressible water and grains and k = 0.01 m/s, until a wave returns
-   from the base (after de Boer, Ehlers and Liu 1993).  The settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2
-   a) ds, with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
+3. A sudden load acts on the same column, with incompressible water and grains, and k = 0.01 m/s.  Results are compared
+   until a wave returns from the base (after de Boer, Ehlers and Liu 1993).  The settlement is q / (M a^(1/2)) int
+   exp(-b s / 2 a) I0(b s / 2 a) ds, with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
 
 The equations are the u-p form: water accelerates with the grains.
 """
