@@ -2,9 +2,9 @@
 """Conditions on sides of bodies: tractions, pressures, displacements, plates, drained sides, prescribed flux, rain.
 
 Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y),
-as before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes faces that
-touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).  Reference areas
-refer to the seeded shape, after the maps.
+by their position before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes
+faces that touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).
+Reference areas refer to the seeded shape, after the maps.
 
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
 balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
@@ -147,7 +147,7 @@ class Quiet(Condition):
     ValueError
         From the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the side;
         another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid that
-        fixes it; a weight that changes as the stage begins, because the traction at rest does not change.
+        fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
     side: str
@@ -235,8 +235,8 @@ class Drained(Condition):
     region : ((d,), (d,)), m
         Box of reference positions; the parts of faces inside it are drained.
     seepage
-        Seepage face: where the outside pressure is <= 0, as above a water level, water can leave but not enter.  The
-        pore pressure there is at most the outside pressure, and lower only where no water leaves.
+        Whether the side is a seepage face: where the outside pressure is <= 0, as above a water level, water can leave
+        but not enter.  The pore pressure there is at most the outside pressure, and lower only where no water leaves.
 
     Raises
     ------
@@ -320,7 +320,7 @@ class Rain(Flux):
     given rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.  `outflows` of
     the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s (m^2/s in plane
     strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")`: outflow through
-    all open sides; `outcome("ran_off")`: run-off and seepage here; `outcome("ponded")`: water ponded on the side.
+    all open sides; `outcome("ran_off")`: run-off and seepage on this side; `outcome("ponded")`: ponded water.
 
     Parameters
     ----------
@@ -402,7 +402,7 @@ WEAK = 8.0
 Sensitivity (soil scene): half the value changes the result by 5.0e-06, twice by 7.9e-06, finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of laws with a state, because yielding soil is much softer.
+"""Factor on the elastic modulus in the penalty of laws with state variables, because yielding soil is much softer.
 
 Sensitivity (soil scene): half the value changes the result by 6.5e-05, twice by 1.9e-05, finer cells by 3.0e-02.
 """
@@ -446,7 +446,7 @@ class Displacement(Condition):
     ------
     ValueError
         From the scene or the step: no point on the side; invalid value or components; a moving component that a wall
-        fixes; another `Displacement` of a component on the same part of a face, or with another value at a common edge.
+        fixes; another `Displacement` of the component on the same part of a face, or other values at a common edge.
     """
 
     side: str

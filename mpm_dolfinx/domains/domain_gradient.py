@@ -73,7 +73,7 @@ def volume_slopes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the volumes (n,) of domains, m^d, and their derivatives (n, 2^d, d) by the corners, m^(d-1).
 
-    In axisymmetry volumes of rings, m^3, the integrals of pi r^2 dz around the domains, and their derivatives, m^2.
+    In axisymmetry, these are volumes of rings, m^3, integrals of pi r^2 dz around domains, and derivatives, m^2.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:

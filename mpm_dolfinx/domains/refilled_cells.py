@@ -139,7 +139,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return cells that cannot be renewed: with other points, several bodies, or faces of different conditions."""
+        """Return cells that cannot be renewed, as they contain other points, several bodies, or several conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -236,7 +236,7 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of each of these cells among the renewed cells."""
+        """Return the number of each of these cells among the renewed cells, which is the group of its new domains."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
@@ -363,7 +363,7 @@ class RefilledCells:
 
     @cached_property
     def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """The results of `remainders` and `outside`; each piece is one group."""
+        """The results of `remainders` and `outside`.  New domains from the same piece form a group, see `New`."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))

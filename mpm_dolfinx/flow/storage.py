@@ -259,7 +259,7 @@ class StorageSystem:
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
         self.set_alternation()
-        _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
+        _add_diagonal(self.L, np.zeros(own.size))  # also of a cell without faces
         pattern = self.L
         if forms.softens:
             grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
@@ -372,7 +372,7 @@ class StorageProblem:
     inertial
         Function that returns the inertia forces on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
-        Suctions (n,), Pa, at which the pores of these cells drain, or None.
+        Suctions (n,), Pa, at which the pores of the active owned cells drain, or None.
     """
 
     def __init__(
@@ -482,7 +482,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content caused by pressure errors (n,), Pa, and changes of it in the step (n,)."""
+        """Return errors of the water content caused by pressure errors (n,), Pa, and its changes (n,) in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume

@@ -32,7 +32,7 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Axis and end of each side of a box: (axis, 0 for the lower or 1 for the upper end)."""
-REACH = 1e-4  # cells: bodies may lie outside the grid by this distance, by which a penalty misses a wall
+REACH = 1e-4  # cells: bodies may lie outside the grid by this distance, because a penalty holds them at walls inexactly
 
 TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
@@ -112,7 +112,7 @@ class Cells:
     num_owned, num_local
         Number of cells without and with ghosts.
     cell_nodes, signs
-        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from the midpoint to each (2^d, d).
+        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from midpoint to nodes (2^d, d).
     at
         Current positions.
     cell_number, locals, owners
