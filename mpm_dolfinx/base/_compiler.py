@@ -97,7 +97,7 @@ def _folder() -> Path:
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
-    """Return a new folder for libraries, which is removed at the end of the run."""
+    """Return a new folder for libraries that exists until the end of the run."""
     allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
     what = f"{cache}: {why.strerror}: cache folder of dolfinx's compiled forms"
     try:

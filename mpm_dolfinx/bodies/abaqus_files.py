@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of Abaqus (and CalculiX) input files: a meshio mesh with placed instances, sets and surfaces.
+"""Reader of Abaqus (and CalculiX) input files, which returns a meshio mesh with placed instances, sets and surfaces.
 
 meshio's reader keeps only the nodes of the last part, and ignores the placement of instances.
 """

@@ -173,7 +173,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.
+        lines.  If it is 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.
     material
         Index of the material in the scene's list, >= 0.
 

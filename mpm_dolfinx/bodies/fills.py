@@ -72,9 +72,9 @@ def put(
 ) -> MaterialPoints:
     """Return the material points of a fill, placed onto the active bodies.
 
-    Sides of the fill that touch a neighbour as seeded follow the neighbour's displacement.  The side opposite to the
-    largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero velocity;
-    its domains have the volumes of the displaced shape.
+    Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
+    the largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero
+    velocity; its domains have the volumes of the displaced shape.
 
     Parameters
     ----------

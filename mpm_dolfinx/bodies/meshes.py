@@ -365,7 +365,7 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Raise an error for surface faces of one mesh that touch each other; they would be loaded and drained."""
+    """Raise an error for surface faces of one mesh that touch each other, because conditions would act on them."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):

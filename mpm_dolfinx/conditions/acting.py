@@ -158,7 +158,7 @@ class Loads:
         """With inertia, return the data of this converged substep that the next substep needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers at u on this process, W: dissipation by slip, and further power not computed from `push`.
+        """Return two powers at u on this process, W: dissipation by slip, and any power that `push` does not show.
 
         `v` are nodal velocities, a local array, m/s.
         """
@@ -168,7 +168,7 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces.  The scale of residuals leaves these forces out."""
+        """Add the constant part of the penalty forces.  The scale of residuals does not include these forces."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
@@ -177,7 +177,7 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that are scaled together with the internal forces."""
+        """Add forces at u that count as internal forces, also in the scale of residuals."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components fixed by walls."""
@@ -202,7 +202,7 @@ class Loads:
         """Return minus the derivative of the forces in `push`, without the part in `tangent`."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u, and return whether this changed.  `sticks`: points may return to stick."""
+        """Update which points slip at u, and return whether any changed.  `sticks`: points may return to stick."""
         return False
 
     def augment(self, at: At) -> bool:

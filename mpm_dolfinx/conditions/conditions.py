@@ -9,8 +9,8 @@ Reference areas refer to the seeded shape, after the maps.
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
 balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-Values may be functions of time t, reference positions X and current positions x.  The parameter names decide; see
-`validation`.
+Values may be functions of time t, reference positions X and current positions x.  Their parameter names decide which
+they receive, see `validation`.
 
 An invalid condition raises a ValueError when the condition, a scene or a stage is created.  An invalid value of a
 function raises the error in the step that needs the value.  A condition is equal only to itself, because values and
@@ -129,9 +129,9 @@ class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
     The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
-    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few
-    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies
-    with weight need such a stage.
+    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; a few per cent of
+    oblique waves are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies with
+    weight need such a stage.
 
     Parameters
     ----------
@@ -330,8 +330,8 @@ class Rain(Flux):
         Rain per current area of the side, as a volume at zero pressure.  Finite; negative for potential evaporation.
         Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
-        Largest pressure of ponded water, Pa, >= 0: depth times unit weight.  The pond has one depth for the whole side.
-        Water runs off once the pond is full; ponded water infiltrates or evaporates later.
+        Largest pressure of ponded water (depth times unit weight), Pa, >= 0.  The pond has one depth for the whole
+        side.  Water runs off once the pond is full; ponded water infiltrates or evaporates later.
     driest
         Lowest pressure at the side, Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By Kelvin's
         equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
@@ -417,8 +417,9 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity,
-    3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and 30 times 4G gives 1.01 times the exact pressure.
+    difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity, a
+    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and of 30 times 4G, 1.01 times the exact
+    pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 

@@ -126,7 +126,7 @@ class ToolPairs(Pairs):
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs of points on the surface of one group with opposite positions on another group, along normals."""
+    """Contact pairs of points on the surface of a group with opposite positions, along normals, on another group."""
 
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m

@@ -68,7 +68,7 @@ class LinearMotion:
 
 
 class Found(NamedTuple):
-    """Contact at given displacements."""
+    """Geometry, forces and tool motions of a contact at given displacements."""
 
     at: Geometry  # geometry of the pairs
     touch: Touch  # forces of the pairs

@@ -42,7 +42,7 @@ class Pose(NamedTuple):
         return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the current positions of positions y (m, d) in the frame of the tool."""
+        """Convert positions y (m, d) in the frame of the tool to current positions."""
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
@@ -102,8 +102,8 @@ class Tool:
         Initial velocity of a free tool.
     moment
         Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
-        that of a uniform disc or polygon.  Without it, other shapes and tools with `direction` do not rotate.  Results
-        are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, do not rotate without a given
+        value.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name

@@ -364,7 +364,7 @@ class Tools(Touching):
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
         """Return a position x (n, d) whose path between two times (s) crosses a tool, or "" if there is none.
 
-        The paths are straight.  The search proceeds by the distance to the tool (sphere tracing: Hart 1996).
+        Paths are straight.  Steps of the search are as long as the distance to the tool (sphere tracing: Hart 1996).
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))

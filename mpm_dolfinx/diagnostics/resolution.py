@@ -127,9 +127,9 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
 
 
 COARSE = 0.7  # of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
-FEW = 3  # points over the thickness with an eighth too much bending.  Source: exact, 1 / (n^2 - 1)
+FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
 SLENDER = 4  # length / thickness from which a body counts as a beam
-LOST_WET = 2.5  # lost stiffness of wet beams times n^2: 1.8, 2.3, 3.2 with n = 4, 8, 16, sealed
+LOST_WET = 2.5  # (lost fraction of a wet beam's stiffness) x n^2: 1.8, 2.3, 3.2 with n = 4, 8, 16, sealed
 FEW_WET = int((100 * LOST_WET) ** 0.5)  # points with a loss of 1 %.  Source: exact, by LOST_WET
 SLENDER_WET = 2  # length / thickness from which a wet body counts as a beam
 

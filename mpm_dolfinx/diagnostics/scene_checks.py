@@ -38,7 +38,7 @@ def check_held(
     Raises
     ------
     ValueError
-        A part can move.  The message gives its place, and its number of free rigid-body modes.
+        A part can move as a rigid body.  The message gives its place, and its number of free rigid-body modes.
     """
     grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)

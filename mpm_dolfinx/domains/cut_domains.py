@@ -232,7 +232,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with the owners of cells, and their cells and positions (m, d), m, for corners or points."""
+        """Exchange with the owners of cells, and the cells and positions (m, d), m, of corners or points."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim

@@ -2,9 +2,9 @@
 """Particle domains of yielded soil keep the volumes of their points.
 
 The volume ratio of a point is a mean over its cell, but the corners of its domain follow a field that varies in the
-cell, and edges stay straight.  In elastic soil F and the ratios of cells follow from the corners.  In yielded soil F is
-incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the corners of
-yielded domains therefore move by the smallest d with
+cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In yielded
+soil F is incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the
+corners of yielded domains therefore move by the smallest d with
 
     sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2  ->  min,
 

@@ -37,7 +37,7 @@ CRUMB = NEAR
 SMALL = (0.5 / EDGES) ** 2
 """Area limit, as a fraction of the cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
-Source: definition, a square half of an edge wide.
+Source: definition, a square as wide as half of one of the `EDGES` in a cell.
 """
 COVERED = 0.25
 """Largest difference between pieces' area and filled area of a cell, in cells.  Source: definition, one domain."""

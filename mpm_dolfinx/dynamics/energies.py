@@ -48,7 +48,7 @@ def after(
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, after a step from the energies before it.
+    """Return the energies, J, after a step, from the energies before the step.
 
     kinetic: kinetic energy of free tools, J; seconds: time weights of the substeps, s; powers: powers of the substeps
     on this process, W, see `MomentumProblem.powers`.

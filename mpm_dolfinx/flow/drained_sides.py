@@ -38,7 +38,7 @@ THICK = np.sqrt(2)
 
 The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) away from the plane.  A
 face that is closer to the centroid of the cell's material, or behind it, bounds only a part of the material, and must
-not drain the whole.
+not drain the whole cell.
 """
 
 
@@ -277,7 +277,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return sides with the pressure and water supply of ponds over a time dt (s), and the ponds' capacities, m^d.
+        """Return sides with the pressure and water supply of ponds in a time dt (s), and the capacities of ponds, m^d.
 
         `ponds` are the largest depths, m.
         """

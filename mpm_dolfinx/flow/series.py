@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-The soils between the pressure positions of two cells lie in series.  The pressures at their interfaces are local
+The soils between the pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local
 unknowns of each face.  Newton's method finds them from the continuity of the flux; they are then condensed.  Each soil
 conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
 therefore exact at any offset from the grid.
@@ -79,7 +79,7 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Segments of soil along the flow path through a face.  Each connects two nodes, which have pressures."""
+    """Segments of soil along the flow path through a face.  Each connects two nodes, positions with a pressure."""
 
     face: NDArray[np.int64]  # the face
     low: NDArray[np.int64]  # first node

@@ -94,7 +94,7 @@ class StorageForms:
     active
         Active part of the grid.
     materials
-        Materials of the scene, and its fluid. With retention curves the pieces have the fields retention, lever, pores.
+        Materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`, `pores`.
     weight : (d,), N/m^3
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
@@ -278,7 +278,7 @@ class StorageSystem:
         return form and form.on(self._facets if relative is None else relative.uniform(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and no fixed positions, see `multigrid_solver`."""
+        """Return grid positions of this process's unknowns; the array of fixed positions is empty."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
@@ -424,7 +424,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the additional damping, minus the flow, of cells of softness (n,) and damping tau (n,), 1/Pa."""
+        """Return the matrix of additional damping in cells of softness (n,); tau (n,), 1/Pa: that of elastic soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)

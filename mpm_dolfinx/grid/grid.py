@@ -215,9 +215,9 @@ class Grid:
         points (parameters t, x or both) returns the same number of lines, between the same sides.  A tool must be a
         condition of the first stage; lines stay in stages without it.
     axisymmetric
-        The first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes, forces
-        and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is
-        the axis, where radial displacements are zero.
+        Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
+        forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
+        is the axis, where radial displacements are zero.
 
     Raises
     ------
@@ -638,7 +638,7 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the factors (n, 2^d) of the shape functions, which are linear, for each axis."""
+        """Return for each axis the factors (n, 2^d) of the shape functions, which are linear along this axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
