@@ -32,7 +32,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
 """Inclination of layers above which the pressure position of a cell moves to the most conductive part.  Halving this
-value changes the result of scene `slope` in tests/plateaus.py by 4.1e-04 (relative), doubling it by 5.0e-05, and finer
+value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative), doubling it by 5.0e-05, and finer
 cells by 3.4e-03.
 """
 PAIRS = 2**16

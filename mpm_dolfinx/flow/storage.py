@@ -62,7 +62,7 @@ from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
 """Fraction of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].  Halving
-this value changes the result of scene `beam` in tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and
+this value changes the result of scene "beam" in tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and
 finer cells by 1.5e-02.
 """
 
