@@ -121,9 +121,9 @@ class MixedCells:
     ) -> Mobility:
         """Return the mobility of filled cells, from means (n,) and mobilities `kappa` of all pieces, m^2/(Pa s).
 
-        `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  In
-        unsaturated soil, `now` are mobilities of all pieces at their pressures.  The pressure then refers to the
-        centroid, unless layers are inclined.
+        `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  `now`
+        are the mobilities of all pieces at their pressures, in unsaturated soil.  If it is given, only inclined layers
+        shift the position of the cell pressure away from the centroid.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:

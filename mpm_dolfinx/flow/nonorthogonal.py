@@ -2,9 +2,9 @@
 """Non-orthogonal correction of fluxes between cells and through open sides.
 
 The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
-inclined to the grid, the two centroids also differ by a vector t along the face, of up to half a cell.  The resulting
-error does not decrease with h.  With the gradients g, in both cells, of the pressure minus the weight of the fluid, the
-corrected flux is
+inclined to the grid, the centroids of both cells also differ by a vector t along the face, up to half a cell.  The
+resulting error does not decrease with h.  With g, the pressure gradient minus the unit weight of the fluid in each
+cell, the corrected flux is
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t].
 
@@ -133,7 +133,7 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the gradients (rows, d), Pa/m, of the pressure minus the weight of the fluid.
+        """Return the pressure gradients minus the unit weight of the fluid (rows, d), Pa/m.
 
         Parameters
         ----------

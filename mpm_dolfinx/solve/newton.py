@@ -326,12 +326,19 @@ class Newton:
         """Raise NotConverged at an unstable equilibrium, because smaller steps find the path that leaves it.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
-        delays buckling. If a step has kept its first tangent, the check follows in the next step.
+        delays buckling. If a step has kept its first tangent, the check follows in the next step. An equilibrium within
+        tolerance may seem unstable where only soft springs resist a motion, so it is corrected once.
         """
         if not negative_pivots(self._solvers.solve_u):
             return
         self._linearise()  # the last tangent may belong to another state
-        if count := negative_pivots(self._solvers.solve_u):
+        if not negative_pivots(self._solvers.solve_u):
+            return
+        self._solvers.solve_momentum()
+        self._move(-np.ones(self._momentum.system.of_parts.count))
+        errors = self._errors()
+        self._linearise()
+        if (count := negative_pivots(self._solvers.solve_u)) or errors.worst > self._scheme.tolerance:
             why = f"the equilibrium is unstable, its tangent has {count} negative eigenvalues"
             raise NotConverged(why, self.report.history)
 
