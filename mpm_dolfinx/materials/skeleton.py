@@ -106,7 +106,7 @@ class Skeleton:
     argument `cell_size`, the mean edge of a cell, m, which makes softening independent of the grid.
 
     A law that depends on suction has the state `suction`: 0.0, and may have the state `suction_at_start`: 0.0.  The
-    scene sets these to max(-p, 0), Pa, at the end of a substep and at seeding.  For local unknowns it is a `trial` value.
+    scene sets them to max(-p, 0), Pa, at the end of a substep and at seeding.  For local unknowns, use it in `trial`.
 
     For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 
