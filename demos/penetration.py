@@ -1,28 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""A T-bar, a rigid cylinder, is pushed sideways through clay, deep below the surface.
+"""A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is von Mises's, undrained, of strength s_u in plane strain.  The bar starts in place and is pushed until the
-clay flows all around it.  Then its resistance is that of Randolph and Houlsby (1984), for adhesion alpha s_u on it,
+The clay is undrained, and follows von Mises's law, with strength s_u in plane strain.  The bar starts inside the clay
+and is pushed until the clay flows all around it.  Then the resistance of the bar is that of Randolph and Houlsby (1984)
+for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-Half of the clay, a block eight diameters wide and high, lies between smooth walls.  A pressure on its top keeps the gap
-behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.  In a
-narrower block the resistance is lower: four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 for a
-rough bar.
+The clay is a block, eight diameters wide and high, between smooth walls; half of it is computed.  A pressure on its top
+keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.
+In a narrower block the resistance is lower.  With four diameters, N of a rough bar is 10.9 and 10.8 with 8 and 16 cells
+over the diameter.
 
 Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  The clay is therefore
 seeded again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu
-and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each
-new seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter, and
-`spread` is its variation there.
+and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each new
+seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter.  `spread`
+is the variation of N in these parts.
 
-Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v.  Water of the same pressure
-stands on top, so the clay starts without effective stress.  Wet clay is seeded only once.  The domains ahead of the bar
-are narrower at first, in proportion to their later stretch, and end as wide as the others.
+Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
+c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
+once.  Its domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as
+the others.
 
-With --follow the bar is pushed once more, through small cells that move with it.  Grid lines follow the bar: their
-number stays, and the cells around the small ones widen behind the bar and narrow ahead of it.
+With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
+larger cells widen behind the bar and narrow ahead of it.  The number of cells does not change.
 """
 
 from __future__ import annotations
@@ -58,14 +60,14 @@ FINE_ZONE, RATIO = 1.0, 1.3  # m around the bar with small cells that follow it;
 
 
 def exact(alpha: float) -> float:
-    """Return N of Randolph and Houlsby."""
+    """Return the resistance N of Randolph and Houlsby for the roughness alpha."""
     delta = np.arcsin(alpha)
     half = np.pi / 4 - delta / 2
     return np.pi + 2 * delta + 4 * np.cos(half) * (np.sqrt(2) + np.sin(half))
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between domains; ahead of the bar, at 0, widths fall to `nose` times the other widths."""
+    """Return the angles between domains around the bar; ahead of it, at angle 0, widths are `nose` times the others."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -75,9 +77,9 @@ def angles(around: int, nose: float) -> np.ndarray:
 
 
 def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
-    """Return the grid, with a number of cells over the diameter, half of the block around a bar at y, m, and its top.
+    """Return the grid, half of the block around a bar at the height y, m, and the region of the block's top.
 
-    follow: the bar, if grid lines follow it.
+    cells: number of cells over the diameter.  nose: see `angles`.  follow: the bar, if grid lines follow it.
     """
     h = D / cells
     n = round(HALF * cells)
@@ -103,11 +105,11 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
 @dataclass
 class Push:
-    """A push, by step: depths over D, resistances over s_u D, whether they are used, and excess pressures over s_u.
+    """Results by step: depths / D, resistances / (s_u D), whether errors include them, and excess pressures / s_u.
 
-    frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
-    displacement of the points over that of the bar, since the clay was seeded.  In wet clay it is the excess pressure
-    over s_u. lines: then, along both axes, m.
+    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
+    displacement of the points since the clay was seeded, divided by that of the bar; in wet clay the excess pressure
+    divided by s_u.  lines: final grid lines along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -122,7 +124,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Load the clay, then push a bar of roughness alpha to a depth, over D; the clay is seeded again in each part.
+    """Load the clay, then push a bar of roughness alpha to `depth` diameters; the clay is seeded again in each part.
 
     follow: whether grid lines follow the bar.
     """
@@ -133,7 +135,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar at y over D by a distance over D, from given stresses or the loaded clay; return final stresses."""
+    """Push a bar from y D by `way` D, with initial stresses `stress`, or after loading; return the final stresses."""
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
@@ -159,7 +161,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return the effective stress (n, 3, 3), Pa, at positions x (n, 2), interpolated and within the strength."""
+    """Return a function of positions x (n, 2), m: interpolated effective stress (n, 3, 3), Pa, within the strength."""
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
     between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
@@ -177,7 +179,7 @@ def kept(simulation: mpm.Simulation) -> Callable:
 
 
 def push_wet(rate: float, cells: int, depth: float) -> Push:
-    """Push a smooth bar to a depth, over D, into wet clay, at a rate V."""
+    """Push a smooth bar by `depth` diameters into wet clay, at the rate V = `rate`."""
     grid, body, top = clay(cells, NOSE)
     speed = rate * CV / D  # m/s
     start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
@@ -269,7 +271,7 @@ def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
 
 
 def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
-    """Draw resistances, displacements of the clay around the smoothest and the roughest bar, and pore pressures."""
+    """Draw resistances, displacements of the clay around smoothest and roughest bar, and pore pressures in wet clay."""
     fig, axes = common.figure(2, 4, (17, 8.5))
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
@@ -295,7 +297,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
 
 
 def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the end of a push with the field of its frame."""
+    """Draw the final state of a push, coloured by the field of its frame."""
     corners, values, bar = run.frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An embankment is built on soft clay, which then consolidates: settlement under its middle."""
+"""Settlement under the middle of an embankment that is built on soft clay, which then consolidates."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Excavation below the water table: three lifts are dug, the pit is kept dry, and water seeps to its bottom."""
+"""Pumping rate of a pit below the water table: three lifts are excavated, and the pit is kept dry."""
 
 import mpm_dolfinx as mpm
 

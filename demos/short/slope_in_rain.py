@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rain on a slope: it soaks in, the suction fades, and the factor of safety falls."""
+"""Rain infiltrates a slope, so suction and factor of safety decrease."""
 
 import mpm_dolfinx as mpm
 
