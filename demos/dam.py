@@ -29,9 +29,9 @@ import numpy as np
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-HEIGHT, CREST, SLOPE = 6.0, 3.0, 2.0  # m, m, run over rise
+HEIGHT, CREST, SLOPE = 6.0, 3.0, 2.0  # m, m, slope: run divided by rise
 BASE = CREST + 2 * SLOPE * HEIGHT
-LEVELS = (5.0, 3.0)  # m: of the reservoir, before and after
+LEVELS = (5.0, 3.0)  # m: level of the reservoir, before and after the fall
 WEIGHT = 9810.0  # N/m^3
 LOAM = mpm.LinearElastic(
     bulk=1e9,
@@ -41,8 +41,8 @@ LOAM = mpm.LinearElastic(
     retention=mpm.VanGenuchten(WEIGHT / 2, residual=0.15, n=2.0),
 )
 DAY = 86400.0  # s
-SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: steps until the flow is steady
-FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: of the reservoir's fall; after it began, when the free surface is drawn
+SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: periods of equal steps until the flow is steady
+FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since its start, for the picture
 
 
 @dataclass
@@ -111,7 +111,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
 
 def rectangular(cells: int) -> float:
-    """Return the ratio of the flow through a rectangular dam to the exact flow."""
+    """Return the flow through a rectangular dam, divided by the exact flow."""
     levels, width, top = (10.0, 2.0), 9.6, 12.0
     h = top / cells
     grid = mpm.Grid([0, 0], [width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])
@@ -170,7 +170,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
-    parser.add_argument("--steps", type=int, default=10, help="steps of each length, and of the fall")
+    parser.add_argument("--steps", type=int, default=10, help="steps in each period until steady flow, and in the fall")
     parser.add_argument(
         "--cells", type=int, default=40, help="cells over the height of the rectangular dam, and of the column"
     )

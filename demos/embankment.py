@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An embankment under water is built in lifts on soft clay, which consolidates.
+"""An embankment under water is built in lifts on soft clay, and the clay consolidates.
 
 The scene is half of the section; x = 0 is a plane of symmetry.  On 6 m of clay, a lift of 1 m with slopes of 1:2 is
 built every 90 days.  After four lifts the clay consolidates for ten years.  Each lift is a polygon with named edges
@@ -29,9 +29,9 @@ CLAY, CREST, SLOPE, LIFTS = (
     4.0,
     2.0,
     4,
-)  # m: depth of the clay, half the crest's width; run over rise; lifts of 1 m
+)  # m: depth of the clay, half the width of the crest; slope: run divided by rise; lifts of 1 m
 WIDTH = 24.0  # m: of the section
-PAUSE, END = 90 * DAY, 3650 * DAY  # between two lifts; after the last one
+PAUSE, END = 90 * DAY, 3650 * DAY  # time between two lifts; time after the last lift
 BUOYANT = 0.6 * (2650 - 1000) * 9.81  # N/m^3
 
 

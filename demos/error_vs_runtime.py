@@ -35,7 +35,7 @@ from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
 DEFAULT, BY_ERROR, STANDARD = "MPM, defaults", "MPM, steps by error", "standard MPM, at the points"
-STYLES = {  # of the lines: colour and marker of a method, in all cases
+STYLES = {  # colour and marker of each method, the same in all cases
     DEFAULT: ("C0", "o"),
     PEER: ("C1", "D"),
     STANDARD: ("C3", "s"),
@@ -47,7 +47,7 @@ STYLES = {  # of the lines: colour and marker of a method, in all cases
     TRUTH: ("black", "s"),
 }
 Run = Callable[[], tuple[float | tuple[float, float], mpm.Result, float]]
-"""A run: error (for the beam also that from 0.1 s on), result, compile seconds."""
+"""Error (for the beam also the error from 0.1 s on), result, and compile time, s, of a run."""
 
 
 @dataclass
@@ -124,7 +124,7 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of a box whose top moves by `exact` (m); `width` cells wide, or -1: as high.
+    """Yield (method, setting, run) of a box; exact: displacement of its top, m; width: cells, -1: as the height.
 
     time: end (s) and number of steps of the sweep over the cells; steps: numbers of steps of the sweep over time.
     """
@@ -291,7 +291,7 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
     ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    name = "error_vs_runtime" if case == "beam" else f"error_vs_runtime_{case}"  # the beam's is on the pages
+    name = "error_vs_runtime" if case == "beam" else f"error_vs_runtime_{case}"  # the beam's picture is on the pages
     common.save(fig, out / f"{name}.png", dpi=120)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Physics of your own in a few lines of UFL: columns, each with its exact solution.
+"""Your own physics in a few lines of UFL: ten columns with exact solutions.
 
 In each example, a column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature:
 a stored energy, fibres with a direction at each point, one of two conductivities that depend on the deformation, an
@@ -60,14 +60,14 @@ class Example:
 
 
 def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points' heights at the start (m), upwards, and their displacements along the column (m)."""
+    """Return the initial heights of the points (m), ascending, and their displacements along the column (m)."""
     Y = s.bodies[0].centre[:, 1]
     order = np.argsort(Y)
     return Y[order], (s.points.x[:, 1] - Y)[order]
 
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of the centroids in the cells (m), upwards, and the cells' pore pressures (Pa)."""
+    """Return the heights of the cells' centroids (m), in ascending order, and the pore pressures of the cells (Pa)."""
     cells = s.cells()
     order = np.argsort(cells.x[:, 1])
     return cells.x[order, 1], cells.pressure[order]
@@ -85,7 +85,7 @@ def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
     return "height at the start (m)", "displacement (m)", Y, u, exact
 
 
-# ---- a stored energy of one's own, stiffer from layer to layer -----------------------------------
+# ---- your own stored energy, stiffer from layer to layer -----------------------------------
 
 
 class SaintVenantKirchhoff(mpm.Skeleton):
@@ -98,7 +98,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2): it doubles from each quarter to the next one below."""
+    """Return a modulus, Pa, at reference positions (n, 2); in each quarter of the height it is twice that above."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 
@@ -111,7 +111,7 @@ def energy(cells: int) -> Example:
     return Example("energy, layered", *settlement(s, layers))
 
 
-# ---- fibres: a direction on the points ------------------------------------------------------------
+# ---- fibres: a direction at each point - ------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -219,12 +219,12 @@ def well(cells: int) -> Example:
     return Example("source of fluid", "height (m)", "pore pressure (Pa)", y, p, exact)
 
 
-# ---- a law with state: damage, set anew after every step -------------------------------------------
+# ---- a law with a state variable: damage, updated after each step -------------------------------------------
 
 
 @dataclass(frozen=True)
 class Damaged(mpm.NeoHookean):
-    """Neo-Hookean with damage D: (1 - D) psi, D = 1 - exp(-|ln J| / 0.5) at the largest |ln J| so far."""
+    """Neo-Hookean with damage D: energy (1 - D) psi, D = 1 - exp(-m / 0.5), with m the largest |ln J| so far."""
 
     state: ClassVar = {"damage": 0.0}
 
@@ -270,7 +270,7 @@ def plasticity(cells: int) -> Example:
     """Load sand in an oedometer; the law is in `mpm_dolfinx/materials/drucker_prager.py`."""
     sand = mpm.DruckerPrager(bulk=1e7, shear=1e7, friction=20.0, dilation=5.0, cohesion=5e4)
     strain, stress = path(column(cells, sand, load=1e6), 20)
-    shear = 2 * sand.shear / np.sqrt(3)  # sqrt(J_2) and -p grow by this and by K with the compression
+    shear = 2 * sand.shear / np.sqrt(3)  # growth of sqrt(J_2) with the compression; -p grows by K
     toward = shear - sand.eta * sand.bulk  # the yield surface, which is met at xi c / toward
     beyond = np.maximum(0, strain - sand.xi * sand.cohesion / toward)
     gamma = toward * beyond / (sand.shear + sand.bulk * sand.eta * sand.eta_flow)

@@ -34,7 +34,7 @@ from scipy.sparse import csr_matrix
 
 import mpm_dolfinx as mpm
 
-LIMIT = 100  # s of processor time, for a case: other work on the machine is no fault of it
+LIMIT = 100  # s of processor time for a case, so that other work on the machine does not count
 CLOSED = 1e-8  # residuals and fluid balance
 SHOWN = {
     "fluid-bulk": "water's bulk modulus",
@@ -75,7 +75,7 @@ def hang(*_) -> None:
 
 
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
-    """Run a case and fill in its row; with `rtol`, adaptive steps are at most as long as the scene's."""
+    """Run a case and fill in its row; with `rtol`, adaptive steps are at most as long as the steps of the scene."""
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()
@@ -89,7 +89,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
         row.outcome = "recovered" if result.cuts else "converged"
     except (mpm.GaveUp, ValueError) as refusal:
         row.outcome, row.note, result = "refused", str(refusal), getattr(refusal, "result", result)
-    except Exception as error:  # not one that says clearly what the matter is
+    except Exception as error:  # not an error that explains the problem
         hung = isinstance(error, Hung) or time.process_time() - began >= LIMIT  # some stop within PETSc
         row.outcome, row.note = ("hung", f"more than {LIMIT} s") if hung else ("wrong", repr(error))
     finally:
@@ -138,7 +138,7 @@ def worst(rows: list[Row], name: str) -> float:
 
 
 def table(head: list[str], rows: list[list]) -> str:
-    """Return a Markdown table, with numbers in short form and blanks for missing ones."""
+    """Return a Markdown table, with short numbers, and blanks for missing numbers."""
 
     def cell(v) -> str:
         if isinstance(v, float):

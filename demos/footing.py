@@ -67,18 +67,18 @@ WATER = mpm.Fluid()
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-3}  # V
 COLOURS = ("C0", "C1", "C2")  # of the rates
-STEP = 1 / 14  # of a cell: how far the footing goes in a step
-BOX = (8.0, 2.5)  # width and height of half the soil over B
-COARSE = 5  # cells over the footing's width, at most, where a box twice as wide is beside it
-STIFF = 100  # times stiffer is the soil that meets the theory
-LIMITS_OF = {  # how: depth of the push over B, box
+STEP = 1 / 14  # fraction of a cell that the footing moves in a step
+BOX = (8.0, 2.5)  # width and height of half the soil, divided by B
+COARSE = 5  # largest number of cells over the width, in runs with a box twice as wide
+STIFF = 100  # factor of the stiffness of soil for limit loads
+LIMITS_OF = {  # for limit loads: depth divided by B, box
     "undrained": (0.0012, (2.0, 1.2)),
     "drained": (0.003, (4.0, 1.7)),
     "circular": (0.0012, (2.0, 1.2)),
 }
-NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box over B; of cells that are graded; over the fine ones
-FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil over B
-ROUND = 6.05  # limit load of a rough circular footing over its area and s_u
+NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box, over B; ratios of neighbouring and extreme cells
+FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil, divided by B
+ROUND = 6.05  # limit load of a rough circular footing, divided by area and s_u
 
 
 def capacity(friction: float) -> float:
@@ -87,7 +87,7 @@ def capacity(friction: float) -> float:
     return 2 + np.pi if t == 0 else (np.exp(np.pi * t) * np.tan(np.pi / 4 + np.radians(friction) / 2) ** 2 - 1) / t
 
 
-SURFACE = {  # loads over B c; Davis: tan phi* = sin phi of the same strength in plane strain
+SURFACE = {  # loads divided by B c; Davis: tan phi* = sin phi of the same strength in plane strain
     "undrained": SOIL.xi * capacity(0.0),
     "drained, Davis": SOIL.xi * capacity(np.degrees(np.arctan(SOIL.eta))),
     "drained, associated": capacity(FRICTION),
@@ -135,7 +135,7 @@ class Push:
 
     @property
     def at_end(self) -> Frame:
-        """The frame at the end of the push."""
+        """The frame at the end of penetration."""
         return next(frame for frame in self.frames if frame.t >= 1 - 1e-9)
 
 
@@ -223,11 +223,11 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
-    parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
-    parser.add_argument("--steps", type=int, help="only push at the intermediate rate, in so many equal steps")
-    parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil over B")
+    parser.add_argument("--depth", type=float, default=1.0, help="final depth divided by the footing's width")
+    parser.add_argument("--steps", type=int, help="run only the intermediate rate, in this number of equal steps")
+    parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil divided by B")
     methods = ("sdirk2", "backward-euler")
-    parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: of time integration")
+    parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: time integration")
     what = "with --steps: viscosity of the soil over the cohesion and the time of the push"
     parser.add_argument("--viscosity", type=float, default=0.0, help=what)
     parser.add_argument(
@@ -470,7 +470,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
 
 
 def animate(out: Path, run: Push) -> None:
-    """Draw the push and the consolidation as an animation."""
+    """Draw penetration and consolidation as an animation."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     fig, ((ax,),) = common.figure(1, 1, (6.4, 3.9))

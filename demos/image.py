@@ -25,11 +25,11 @@ from scipy.ndimage import gaussian_filter, label
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-EDGE, HOLES, CONTRAST, POROSITY = 1e-3, 0.12, 10.0, 0.8  # m; share of holes; of white over black tissue; -
+EDGE, HOLES, CONTRAST, POROSITY = 1e-3, 0.12, 10.0, 0.8  # m; fraction of holes; stiffness ratio white to black; -
 BULK, SHEAR, CONDUCTIVITY = 2e4, 1.5e4, 1e-9  # Pa, Pa, m/s: those of black tissue
-LOAD, RAMP, SMALL = 1.2e4, 1.0, 1.0  # Pa; s in which it comes; Pa, of the modulus
+LOAD, RAMP, SMALL = 1.2e4, 1.0, 1.0  # load, Pa; time of loading, s; load for the modulus, Pa
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
-TOP = ((0.0, 0.999 * EDGE), (EDGE, EDGE))  # region of the upper edge: holes have sides that look up, too
+TOP = ((0.0, 0.999 * EDGE), (EDGE, EDGE))  # region of the upper edge, because holes also have sides that face up
 
 
 def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
@@ -140,9 +140,9 @@ def run(tissue: Tissue, rtol: float) -> Outcome:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--pixels", type=int, default=48, help="over the edge of the picture")
+    parser.add_argument("--pixels", type=int, default=48, help="pixels along the edge of the image")
     parser.add_argument("--seed", type=int, default=9, help="of the picture")
-    parser.add_argument("--rtol", type=float, default=1e-2, help="error of the steps")
+    parser.add_argument("--rtol", type=float, default=1e-2, help="relative error of the adaptive steps")
     o = parser.parse_args(argv)
     if not 8 <= o.pixels <= 200:
         parser.error(f"--pixels {o.pixels}: must be 8 to 200")

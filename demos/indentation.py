@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A rigid cylinder is pressed into a wet gel and held, and its force relaxes as the gel drains.
+"""A rigid cylinder is pressed into a saturated gel and stays there; the force relaxes as the gel drains.
 
 The scene is in plane strain, and only half of the gel is computed, by symmetry.  This half is 5 m wide and high, lies
 on a smooth base, and drains at its side, far from the cylinder.  The cylinder moves down in the first step and is then
@@ -31,7 +31,7 @@ DEPTH = 0.03  # m
 UNDRAINED, DRAINED = 4 * GEL.shear, E / (1 - NU**2)  # Pa: E*
 TIME = SIZE**2 * mpm.Fluid().unit_weight / (GEL.conductivity * GEL.oedometric)  # s: of consolidation
 INSTANT = 1e-8  # of it
-TIMES = np.geomspace(1e-4, 10, 21)  # over it: at which the force is recorded
+TIMES = np.geomspace(1e-4, 10, 21)  # times divided by this time, at which the force is recorded
 
 
 @dataclass
@@ -68,7 +68,7 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
     """Return half of the gel under the cylinder, with `cells` cells per metre; wet: with pore water."""
     n, h = round(SIZE * cells), 1 / cells
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
-    top = SIZE + 0.3 * h  # the surface is no line of the grid
+    top = SIZE + 0.3 * h  # the surface is not on a grid line
     at_once = INSTANT * TIME
     shape = mpm.Ball((0, top + RADIUS), RADIUS)
     ball = mpm.Tool(shape, displacement=lambda t: (0, -DEPTH * min(1, t / at_once)), name="ball")
@@ -101,7 +101,7 @@ class Pressed:
 
 
 def pressed(cells: int, wet: bool) -> Pressed:
-    """Press the cylinder into the gel and, if it is wet, let it drain."""
+    """Press the cylinder into the gel; let a saturated gel drain."""
     s = scene(cells, wet)
     tool = s.conditions[0]
     result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
@@ -119,7 +119,7 @@ def pressed(cells: int, wet: bool) -> Pressed:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact")
+    parser.add_argument("--cells", type=int, default=12, help="cells per metre; the contact is about 1.5 m wide")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 64:
         parser.error(f"--cells {o.cells}: must be 4 to 64")

@@ -22,8 +22,8 @@ import slope as still
 import mpm_dolfinx as mpm
 
 GRAVITY = 9.81  # m/s²
-LASTS, REST = 7.0, 0.05  # s; m/s: slower than this it is at rest
-BALANCE = 0.01  # share of the work of the weight by which energies may be off
+LASTS, REST = 7.0, 0.05  # s; m/s: below this speed the slope counts as at rest
+BALANCE = 0.01  # allowed error of the energy balance, relative to the work of the weight
 
 
 def slope(cells: int) -> mpm.Simulation:

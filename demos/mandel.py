@@ -110,7 +110,7 @@ def errors(out: Outcome) -> dict[str, float]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=40, help="cells over the width, four times those over the height")
+    parser.add_argument("--cells", type=int, default=40, help="cells over the width; over the height: a quarter")
     parser.add_argument("--steps", type=int, default=30, help="equal steps to each of T = 0.01, 0.1, 0.5, 1")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 1:

@@ -45,18 +45,18 @@ STRENGTH, PRESSURE = 1e3, 2e4  # Pa: s_u of the undrained clay, and the pressure
 SHEAR = 100 * STRENGTH
 ROUGH = (0.0, 0.5, 1.0)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
-LEG, STEADY = 0.25, 0.75  # diameters after which clay is seeded anew; share of such a way from which on N counts
-BEARS = 0.999  # share of the strength that stresses may take as clay is seeded anew
-STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar goes in a step
-NOSE = 0.02  # width of the wet clay's narrowest domains over that of the others
+LEG, STEADY = 0.25, 0.75  # diameters between seedings; fraction of this distance after which N is used
+BEARS = 0.999  # largest stress after a new seeding, as a fraction of the strength
+STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar moves in a step
+NOSE = 0.02  # width of the narrowest domains of saturated clay, divided by that of the others
 PARTS = 4  # each of those that widen away from the nose is a part of its distance from there
 CLAY = mpm.DruckerPrager(2 * SHEAR, SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH, conductivity=1e-9)
 WATER = mpm.Fluid()
 CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-2}  # V
-SETTLED = 1e-3  # of the push's time: that in which the pressure comes
+SETTLED = 1e-3  # fraction of the time of the run in which the pressure is applied
 BALANCE = 1e-8  # relative error of the fluid balance that is allowed
-FINE_ZONE, RATIO = 1.0, 1.3  # m around the bar with small cells that follow it; ratio of the cells beyond
+FINE_ZONE, RATIO = 1.0, 1.3  # m: region of small cells around the bar; ratio of cell sizes outside this region
 
 
 def exact(alpha: float) -> float:
@@ -94,7 +94,7 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
     top = ((0, size[1] - around / 4 * h / 2 - HALF - 1e-9), tuple(size))
 
-    def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the block's sides, ever larger
+    def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the sides of the block, with increasing size
         angle = np.interp((X[:, 1] + HALF) / (h / 2), np.arange(len(at)), at)
         e = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
         reach = 1 / np.maximum(e[:, 0] / HALF, np.abs(e[:, 1]) / np.where(e[:, 1] > 0, HALF - y, HALF + y))
@@ -214,9 +214,9 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
     parser.add_argument("--depth", type=float, default=1.0, help="of the pushes, over the diameter")
-    parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in wet clay")
+    parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in saturated clay")
     parser.add_argument("--wet-depth", type=float, default=1.0, help="of the pushes into wet clay, over the diameter")
-    parser.add_argument("--follow", action="store_true", help="push the last bar once more, with lines that follow it")
+    parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
         parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 4], in [0, 1]")
@@ -248,7 +248,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar through lines that follow it; return resistance and number of cells, relative to equal cells."""
+    """Push a bar on grid lines that follow the bar; return resistance and number of cells, relative to equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))

@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, tips: dict[str, list[float]], exact: float) -> None:
-    """Draw the tip's deflection against the number of steps."""
+    """Draw the tip deflection against the number of steps."""
     fig, ((ax,),) = common.figure(1, 1, (7, 4.2))
     ax.axhline(exact, color="black", lw=1, label="Taylor-Hood FEM")
     ax.plot(o.steps, tips["domain"], "o-", label="exact pieces of the points' domains")

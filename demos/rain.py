@@ -41,9 +41,9 @@ DAY = 86400.0  # s
 TIMES = (0.25, 0.5, 1.0, 2.0, 20.0)  # days
 BANK, BANK_ANGLE, CREST, RANGE = 5.0, np.radians(60.0), 3.0, 11.0  # m, -, m, m
 RAIN, LONGEST = 6e-5, 60e3  # m/s; s, in which the bank fails
-SLIDES, MOVES, REST = 5.0, 0.2, 0.05  # s; m, what has moved by more slides; m/s, slower than this it is at rest
+SLIDES, MOVES, REST = 5.0, 0.2, 0.05  # s; m: smallest displacement of a slide; m/s: largest speed at rest
 LEAKS = 2e-8  # of the water in the bank
-BALANCE = 0.01  # share of the work of the weight by which energies may be off
+BALANCE = 0.01  # allowed error of the energy balance, relative to the work of the weight
 
 
 def column(cells: int) -> mpm.Simulation:
@@ -166,7 +166,7 @@ def bank_in(ax, one: Shot):
 
 
 def animate(path: Path, film: list[Shot], rained: int) -> None:
-    """Draw hours of rain and seconds of the slide as an animation."""
+    """Draw the hours of rain and the seconds of the slide as an animation."""
     from PIL import Image
 
     fig, ((ax,),) = common.figure(1, 1, (5.6, 3.3))

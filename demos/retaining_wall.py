@@ -52,7 +52,7 @@ def coulomb(delta: float, way: int) -> float:
 
 
 def slip_line(delta: float, way: int) -> np.ndarray:
-    """Return the edge (n, 2), m, of the flowing sand, from the toe to the surface."""
+    """Return the edge (n, 2), m, of the yielding sand, from the toe to the surface."""
     p, d = np.radians([PHI, delta])
     fan, rankine = (np.arcsin(np.sin(d) / np.sin(p)) + way * d) / 2, np.pi / 4 - way * p / 2
     at_wall, apex = np.pi / 2 - rankine - fan, np.pi / 2 - way * p

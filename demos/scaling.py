@@ -132,7 +132,7 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
-    # Open MPI: who waits leaves the processor to others, so that the time does not depend on other work
+    # Open MPI: a waiting process yields the processor, so that times do not depend on other work
     environment = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:

@@ -72,8 +72,8 @@ def errors(out: Outcome) -> dict[str, float]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=64, help="cells over the first height")
-    parser.add_argument("--steps", type=int, default=40, help="equal steps of gravity")
+    parser.add_argument("--cells", type=int, default=64, help="cells over the initial height")
+    parser.add_argument("--steps", type=int, default=40, help="equal steps in which gravity increases")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1")

@@ -22,10 +22,10 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground that is there
+LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground in the scene
 SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # of ground and layer: m/s, kg/m³, -
-PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: of Ricker's wavelet, its middle, and of the run
-BAND = (0.5, 6.5)  # Hz, in which spectra are compared
+PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: frequency and middle of Ricker's wavelet, duration of the run
+BAND = (0.5, 6.5)  # Hz: range in which spectra are compared
 BOUNDS = {"amplification": 0.03, "energy": 0.01}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Factor of safety of a slope, and its run-out after a larger loss of strength.
+"""Factor of safety of a slope, and run-out after a larger loss of strength.
 
 A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, without
 dilation.
@@ -55,7 +55,7 @@ def slope(cells: int) -> mpm.Simulation:
     )
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(grid, bodies, [soil], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)])
-    s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
+    s.run(1e9, 1e9, progress=False)  # time after which viscous stresses are negligible
     s.stage(reset_displacement=True)
     s.t = 0.0
     return s
@@ -74,7 +74,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--steps", type=int, default=40, help="steps of the slide")
-    parser.add_argument("--rtol", type=float, default=0.01, help="accuracy of the factor of safety")
+    parser.add_argument("--rtol", type=float, default=0.01, help="relative accuracy of the factor of safety")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or o.steps < 1 or not 1e-3 <= o.rtol <= 0.1:
         options = f"--cells {o.cells} --steps {o.steps} --rtol {o.rtol:g}"

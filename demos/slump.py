@@ -44,7 +44,7 @@ SCALE = WEIGHT * HEIGHT  # Pa
 SHEAR = 30 * SCALE
 FRICTION, CONDUCTIVITY = 25.0, 1e-9  # degrees, m/s
 STRONG, WEAK = 0.3 * SCALE, 0.01 * SCALE  # cohesion before and after, Pa
-DURATION = 600.0  # s, in which it is lost
+DURATION = 600.0  # s: time in which the cohesion is lost
 VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
 THEORY, RUNAWAY = 3.78, 20
 CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
@@ -66,13 +66,13 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
     )
     walls = {"left": "x", "bottom": "xy"}
     simulation = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls=walls, **scene)
-    simulation.run(1e12, 1e12, progress=False)  # time enough for the water to leave, where it can
+    simulation.run(1e12, 1e12, progress=False)  # long compared with the time of drainage
     simulation.stage(reset_displacement=True)
     simulation.t = 0.0
     return simulation, mpm.probes([body], [[length, HEIGHT]])
 
 
-# ---- 1. the strength at which it fails ------------------------------------------------------------
+# ---- 1. the strength at failure - ------------------------------------------------------------
 
 
 @dataclass
@@ -218,7 +218,7 @@ def slump(cells: int, steps: int) -> Slump:
     return out
 
 
-# ---- what comes of it -----------------------------------------------------------------------------
+# ---- results -----------------------------------------------------------------------------
 
 
 def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
@@ -242,7 +242,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
-    parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost")
+    parser.add_argument("--steps", type=int, default=100, help="number of steps in which the cohesion decreases")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 10:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, and >= 10")

@@ -40,8 +40,8 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""Displacement of the base over the height, and the water's storage coefficient times M."""
-STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the layer's time of consolidation
+"""Base displacement divided by the column height; storage coefficient of the water times the oedometric modulus M."""
+STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # fraction of the layer's time of consolidation
 
 
 @dataclass
@@ -75,7 +75,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
     simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
     scene, (on_grid, _) = simulation.scene, simulation.scene.last
     here = on_grid.contents.filled
-    # the cells hold what they held at the start of the last step
+    # cells contain the points of the start of the last step
     y = (grid.base + grid.midpoints[here] + on_grid.contents.centroid[here])[:, 1] + way * HEIGHT * (1 - 1 / steps)
     z, p = np.clip(1 - y / HEIGHT, 0, 1), scene.storage.p.x.array[here] / p0
     volume = scene.momentum.ghost.fill.x.array[here]

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-HEIGHT, STRIP, E, K0 = 1.0, 0.2, 1e6, 1e-6  # m, of the layer and of half the strip; Pa; m/s
+HEIGHT, STRIP, E, K0 = 1.0, 0.2, 1e6, 1e-6  # m: height of the layer, half-width of the strip; Pa; m/s
 WATER = mpm.Fluid(bulk=np.inf)
 SOIL = mpm.Hencky(
     bulk=E / 3,
@@ -53,7 +53,7 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Upward displacements (TIMES, PLACES) over HEIGHT, of Taylor-Hood elements for q/E = 0.25, extrapolated."""
+"""Upward displacements (TIMES, PLACES) divided by HEIGHT; Taylor-Hood elements for q/E = 0.25, extrapolated."""
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
@@ -135,8 +135,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--load", type=float, default=0.25, help="q/E")
-    parser.add_argument("--steps", type=int, default=30, help="in each decade of T from 0.01 on")
-    parser.add_argument("--reference", action="store_true", help="run Taylor-Hood elements on the same cells, too")
+    parser.add_argument("--steps", type=int, default=30, help="steps in each decade of T from 0.01 on")
+    parser.add_argument("--reference", action="store_true", help="also run Taylor-Hood elements on the same cells")
     o = parser.parse_args(argv)
     if o.cells < 5 or not 0 < o.load <= 1 or o.steps < 4 or o.steps % 2:
         parser.error(f"--cells {o.cells} --load {o.load} --steps {o.steps}: must be >= 5, in (0, 1], even and >= 4")

@@ -3,13 +3,13 @@
 
 A comment follows each number.  It contains the command of the demo, the entries of its JSON output, and a format:
 
-    | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
+    | Terzaghi's column, pressure at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
 demos/results contains the output of the demos, with the run time in `seconds` and the release of dolfinx.
 demos/pictures contains the pictures of the first run of each demo on the pages.  A table that a demo writes to a file
 is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
-    bash demos/run.sh tables                        # writes the figures anew from demos/results
+    bash demos/run.sh tables                        # writes the numbers from demos/results
     bash demos/run.sh tables --run terzaghi mandel  # runs these demos first; `--run all` takes hours
 """
 
@@ -105,14 +105,16 @@ def take(run: str, table: str, pictures: bool) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the demos given by --run, if any, and update the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="run what is told of these first, or all")
+    parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="first run these demos, or all")
     o = parser.parse_args(argv)
     told = runs(page.read_text() for page in PAGES)
     demos = {shlex.split(run)[0] for run in told}
     for name in o.run:
         if name not in demos | {"all"}:
             parser.error(f"--run {name}: must be all, or among {', '.join(sorted(demos))}")
-    drawn = {demo: run for run in reversed(told) for demo in shlex.split(run)[:1]}  # a demo's first run draws
+    drawn = {
+        demo: run for run in reversed(told) for demo in shlex.split(run)[:1]
+    }  # the first run of a demo makes the pictures
     for run, table in told.items():
         if {"all", demo := shlex.split(run)[0]} & {*o.run}:
             print(run, flush=True)

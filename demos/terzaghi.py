@@ -24,7 +24,7 @@ from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation, terzaghi_pressure
 
 HEIGHT = 1.0  # m
-SAMPLES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # T_v of the curves that are drawn
+SAMPLES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # T_v of the curves in the picture
 SOIL = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 WATER = mpm.Fluid(bulk=np.inf)
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
@@ -95,7 +95,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="equal steps to T_v = 1")
-    parser.add_argument("--rtol", type=float, help="choose the steps by their error instead")
+    parser.add_argument("--rtol", type=float, help="tolerance of adaptive steps, instead of equal steps")
     parser.add_argument("--method", choices=tuple(METHODS), default="sdirk2", help="time integration")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10:

@@ -61,7 +61,7 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
     squeeze = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
     walls, load = {"left": "x", "bottom": "y"}, mpm.Pressure("right", P0)
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [soil], walls=walls, conditions=[squeeze, load])
-    if not isinstance(soil, mpm.ModifiedCamClay):  # sand begins with its pressure as elastic strain
+    if not isinstance(soil, mpm.ModifiedCamClay):  # the initial pressure of sand is given as elastic strain
         s.stage(fields={"plastic": np.exp(-2 * P0 / (3 * soil.bulk)) * np.eye(3)})
     return s
 
@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--steps", type=int, default=100, help="steps of a test")
-    parser.add_argument("--cost", type=int, metavar="N", help="also print what a step costs, N x N cells")
+    parser.add_argument("--cost", type=int, metavar="N", help="also print the cost of a step, N x N cells")
     o = parser.parse_args(argv)
     for name, value in (("steps", o.steps), ("cost", o.cost)):
         if value is not None and value < 1:

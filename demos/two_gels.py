@@ -86,7 +86,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel")
-    parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies")
+    parser.add_argument("--hertz", type=int, default=18, help="cells per metre of the elastic bodies")
     o = parser.parse_args(argv)
     if min(o.cells, o.hertz) < 4:
         parser.error(f"--cells {o.cells} --hertz {o.hertz}: must be >= 4")

@@ -25,8 +25,8 @@ from mpm_dolfinx.base.time_integration import GAMMA
 LENGTH, DEPTH = 1.0, 0.3  # m, of the beam
 BEAM = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, grain_density=4000.0, porosity=0.5)  # nu = 0, 2000 kg/m³
 EXACT = {"across": 3.2441904, "along": 17.6776695}  # Hz
-AMPLITUDE = 0.05  # of the bar: velocity over that of its waves
-LOST = 0.02  # share of the bar's energy that may be lost in 25 periods of 40 steps
+AMPLITUDE = 0.05  # velocity of the bar, divided by its wave velocity
+LOST = 0.02  # allowed energy loss of the bar in 25 periods of 40 steps
 
 
 class Bar(mpm.LinearElastic):
@@ -90,11 +90,11 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
-        "--h", type=float, nargs="+", default=[0.1, 0.05], help="cells of the beam, m; 0.3 / h is whole"
+        "--h", type=float, nargs="+", default=[0.1, 0.05], help="cell sizes of the beam, m; 0.3 / h must be an integer"
     )
     parser.add_argument("--cells", type=int, default=20, help="cells over the bar")
     parser.add_argument("--periods", type=int, default=25, help="that the bar flies")
-    parser.add_argument("--steps", type=int, default=40, help="steps a period of the bar")
+    parser.add_argument("--steps", type=int, default=40, help="steps in a period of the bar")
     o = parser.parse_args(argv)
     if min(o.cells, o.periods) < 1 or o.steps < 8 or any(abs(DEPTH / h % 1 - 0.5) < 0.49 or h > 0.1 for h in o.h):
         options = f"--h {o.h} --cells {o.cells} --periods {o.periods} --steps {o.steps}"

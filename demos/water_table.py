@@ -38,7 +38,7 @@ CONVERGED = {
 }
 """By hour: heights of the water table at the positions, m."""
 FLOW = 653.1e-4 / HOUR  # m²/s into the ditch after 8 hours
-LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, run over rise, m
+LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, slope: run divided by rise, m
 SEEN = (2.0, 4.0, 6.0, 8.0)  # days
 
 
@@ -93,7 +93,7 @@ def level(t: float) -> float:
 
 
 def levee(h: float) -> mpm.Simulation:
-    """Return the levee on cells of size h, m, with water at rest and the water table at its base."""
+    """Return the levee on cells of size h, m, with hydrostatic water and the water table at its base."""
     base = CREST + 2 * SLOPE * LEVEE
     grid = mpm.Grid([0, 0], [base, LEVEE + 2 * h], [round(base / h), round(LEVEE / h) + 2])
     corners = [(0, 0), (base, 0), (base - SLOPE * LEVEE, LEVEE), (SLOPE * LEVEE, LEVEE)]
@@ -115,8 +115,8 @@ def levee(h: float) -> mpm.Simulation:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; that of the levee is 2.5 h")
-    parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; those of the levee: 9 times")
+    parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; cell size of the levee: 2.5 h")
+    parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; that of the levee: 9 times")
     o = parser.parse_args(argv)
     if not 0.025 <= o.h <= 0.25:
         parser.error(f"--h {o.h:g}: must be in [0.025, 0.25] m")

@@ -127,8 +127,8 @@ def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=40, help="cells over the columns")
-    parser.add_argument("--steps", type=int, default=50, help="steps a period of the load that swings")
+    parser.add_argument("--cells", type=int, default=40, help="cells over the height of the columns")
+    parser.add_argument("--steps", type=int, default=50, help="steps in a period of the harmonic load")
     parser.add_argument("--periods", type=int, default=6, help="that it swings")
     o = parser.parse_args(argv)
     if min(o.cells, o.steps) < 8 or o.periods < 2:

@@ -4,7 +4,7 @@
 import mpm_dolfinx as mpm
 
 DAY = 86400.0  # s
-grid = mpm.Grid(lower=[0, 0], upper=[20, 11], cells=[40, 22])  # m: half of the pit and its ground, by symmetry
+grid = mpm.Grid(lower=[0, 0], upper=[20, 11], cells=[40, 22])  # m: half of the pit and the ground, by symmetry
 lifts = [mpm.box(grid, [0, y], [6, y + 1]) for y in (9, 8, 7)]  # from the surface down
 ground = mpm.polygon(
     grid, [(0, 0), (20, 0), (20, 10), (6, 10), (6, 7), (0, 7)], ["base", "far", "crest", "wall", "pit", ""]
