@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Liakopoulos's column: saturated sand drains at its foot under gravity; suction contracts the sand, and it settles.
 
-A column of 1 m, initially in equilibrium with p = 0 everywhere, is opened at its foot.  Its retention curve is
-user-defined.  The effective stress uses chi p, with chi the saturation.  The reference is a converged solution with 400
-finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
+In a column of 1 m, p = 0 everywhere at first, as in uniform downward flow.  Then no water enters at the top, and the
+column drains at its foot.  Its retention curve is user-defined.  The effective stress uses chi p, with chi the
+saturation.  The reference is a converged solution with 400 finite volumes, for small strain.  Source: Liakopoulos
+(1965), with the constants of Lewis and Schrefler (1998).
 
 Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the largest pressure at this
 time.  Other errors refer to the settlement, and to the outflow at the foot.  On one process.

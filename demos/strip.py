@@ -9,7 +9,7 @@ T = k0 E t/(gamma_w H²) is the reduced time, and the load increases until T = 0
 law, which has no stiffness of the grains, fails.  The package reports this, and the demo shows the results up to this
 time.
 
-The reference for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
+The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
 cells. The extrapolated settlements differ from those of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  Errors:
 `settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once` its error at
 T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` that at the far corner.  All

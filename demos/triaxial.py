@@ -69,7 +69,7 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
     """Return the processor time of a step of each law, divided by that of Drucker and Prager's law.
 
-    The laws take their steps in turn.  Sands have associated flow, because otherwise shear bands form in the block.
+    Steps of the laws alternate.  Sands have associated flow, because otherwise shear bands form in the block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}
