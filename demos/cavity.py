@@ -3,8 +3,8 @@
 
 The body is a quarter of a ring, with initial radius a0 of the cavity and outer radius b = 5 a0.  In each step the wall
 moves by a fifth of a cell, in undrained soil by a tenth.  Such small steps are needed because laws with history are
-first-order accurate in the step.  For normally consolidated clay at a = 1.1 a0, with steps of a fifth of a cell and
-eight cells, pore pressures of the radial solution itself are 1.5 % too low.
+first-order accurate in the step.  With eight cells and steps of a fifth of a cell, the radial solution itself has an
+error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
 1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, expanded so fast that no water flows.  The
    initial pressure acts on the outer boundary.  In incompressible soil the motion is exact: r^2 - a^2 = R^2 - a0^2.
@@ -213,7 +213,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
-    """Draw pressures in drained cavities, and pore pressures around undrained ones as they dissipate."""
+    """Draw pressures in drained cavities, and dissipating pore pressures around undrained cavities."""
     from matplotlib.cm import viridis
 
     fig, ((left, right),) = common.figure(1, 2, (12, 4.2))

@@ -6,9 +6,9 @@ beam, undeformed and bent) and a footing on a column.  Only the product of condu
 product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the water ranges from
 1e4 Pa to infinity.
 
-Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with
-the filtered fixed-stress operator C + beta (V - 3/4 L) as preconditioner.  The second scheme uses the plain operator,
-C + beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson) iteration, with beta = 0.5, 0.75
+Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T. The
+preconditioner is the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C
++ beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson) iteration, with beta = 0.5, 0.75
 and 1 times alpha²/K_dr.  With beta = 1/K_w this iteration diverges.  An iteration consists of one solve of the storage
 and one solve of the momentum.
 

@@ -90,3 +90,26 @@ def test_soil_keeps_its_fluid(scene):
     assert (s.scene.materials.evolved(s.points).mean() > 0.2) != scene.get("elastic", False)
     assert off < 1e-8
     assert abs(s.cells().water.sum() - now) < 1e-8 * exchanged
+
+
+@pytest.mark.parametrize("axisymmetric", [False, True], ids=["strip", "disc"])
+def test_sources_and_forces_per_volume_act_on_the_volumes_of_the_points(axisymmetric):
+    """With a mean dilatation they acted on the mean volumes of cells: forces were up to 2e-7 off in these scenes."""
+    rate, force = 1e-4, 1e3
+    terms = [
+        mpm.Source(lambda points, q: rate * q * points.dx),
+        lambda points, v: force * points.value(v)[1] * points.dx,
+    ]
+    numerics = mpm.Numerics(method="backward-euler", tolerance=1e-11)
+    open_top = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9]))]}
+    s = footing(axisymmetric=axisymmetric, bulk=2.2e9, terms=terms, numerics=numerics, **open_top)
+    start, out = fluid_of(s)[0], 0.0
+    for _ in range(4):
+        volume = (s.points.volume0 * s.points.J).sum()
+        s.step(0.25)
+        out += 0.25 * (np.nansum(s.outflows.array) - rate * volume)
+        held = sum(s.wall_reactions.values())[1] + np.nansum(s.reactions.array.reshape(-1, 2)[:, 1])
+        assert held == pytest.approx(force * volume, rel=1e-8)
+    now, exchanged = fluid_of(s)
+    print(f"fluid off by {abs(now - start + out) / exchanged:.1e} of what was exchanged")
+    assert abs(now - start + out) < 1e-10 * exchanged

@@ -25,7 +25,7 @@ class Sources(Feeding):
     sources
         User functions that return UFL terms.
     pieces
-        Quadrature points of all pieces.
+        Quadrature points of all pieces, with the volumes of the material points.
     p
         Pore pressure of the cells (DG0), Pa.
     t : s

@@ -59,6 +59,7 @@ class QuadratureData:
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
     rows: tuple[NDArray[np.int64] | slice, ...]  # their indices among all points
+    of_points: PointData  # all, with the volumes and F of the points in place of F-bar's, for user-defined terms
 
     def shape_gradients(self) -> NDArray[np.float64]:
         """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the points at which laws use them."""
@@ -168,6 +169,8 @@ class QuadraturePoints:
         fields |= {name: cut.pieces_to_cells(values) for name, values in within.items()} | self._own(cut, points)
         fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        apart = self._extended and self._locks
+        of_points = PointData(self.pieces, places.pieces, weight, fields) if apart else None
         if self._locks and cut.domains:
             share = self._scene.table(points, lambda m: corner_share(m, bool(self._fluid)))
             share = self._scene.locking(points) * share
@@ -178,11 +181,12 @@ class QuadraturePoints:
             if self._weighs:  # the weight of a material point does not depend on the cell's volume ratio
                 fields["density"] = fields["density"] / factor
         pieces = PointData(self.pieces, places.pieces, weight, fields)
+        of_points = of_points or pieces
         if not places.parts:
-            return QuadratureData(pieces, (pieces,), (slice(None),))
+            return QuadratureData(pieces, (pieces,), (slice(None),), of_points)
         parts = zip(self.laws, places.parts, strict=True)
         data = tuple(pieces.part(of, where, rows) for (_, of, _), (rows, where) in parts)
-        return QuadratureData(pieces, data, tuple(rows for rows, _ in places.parts))
+        return QuadratureData(pieces, data, tuple(rows for rows, _ in places.parts), of_points)
 
     def _constant(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the material constants at the integration points."""

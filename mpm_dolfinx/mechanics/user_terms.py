@@ -47,12 +47,7 @@ class OwnTerms:
     """
 
     def __init__(
-        self,
-        terms: Sequence[Callable | OnSide],
-        pieces: FormPoints,
-        forms: FormsOf,
-        t: fem.Constant,
-        dt: fem.Constant,
+        self, terms: Sequence[Callable | OnSide], pieces: FormPoints, forms: FormsOf, t: fem.Constant, dt: fem.Constant
     ):
         self.symmetric = True
         self.holding = False
@@ -101,7 +96,7 @@ class OwnTermsOfStage(Acting):
 
     def _data(self, of: FormPoints, faces: Surface | None, place: Place) -> PointData:
         if faces is None:
-            return place.pieces.pieces
+            return place.pieces.of_points
         p = place.cut.surface(faces)
         area, now = p.area(place.points), p.now(place.points)
         size = np.linalg.norm(area, axis=1, keepdims=True)

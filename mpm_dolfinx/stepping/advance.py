@@ -54,7 +54,8 @@ pressures of a manufactured solution converge with an order below 1.75. Without 
 order in time is unaffected. The mean defect of drained parts is not corrected: with a correction, a column under
 varying gravity has order 1.2 in the step.
 
-Sensitivity (beam scene): half the value changes the result by 1.7e-03, twice by 2.8e-03, finer cells by 1.5e-02.
+Halving this value changes the result of scene `beam` in tests/plateaus.py by 1.7e-03 (relative), doubling it by
+2.8e-03, and finer cells by 1.5e-02.
 """
 
 
@@ -72,11 +73,7 @@ class Motion:
     """
 
     def __init__(
-        self,
-        materials: SceneMaterials,
-        bodies: Sequence[Body],
-        momentum: MomentumForms,
-        storage: StorageForms | None,
+        self, materials: SceneMaterials, bodies: Sequence[Body], momentum: MomentumForms, storage: StorageForms | None
     ):
         self._materials = materials
         self._momentum = momentum
@@ -156,7 +153,7 @@ class Motion:
                 of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and net_inflow is not None:
-                    defect = self._volume_defect(state, points, on_grid, pieces, net_inflow, keeps)
+                    defect = self._volume_defect(state, points, on_grid, data.of_points, net_inflow, keeps)
                     points = replace(points, data=points.data | defect)
             _check_inside(cut, points, t, report)
         stays = stays and not (self._materials.retentions and callable(state.stage.conditions["gravity"]))
@@ -445,12 +442,7 @@ class Motion:
                 water = on_grid.pore_water(points)
                 at_rest = None if water is None else self._at_rest(state.stage, state.t, None)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction,
-                    pieces.fraction * store[pieces.point],
-                    state.stage,
-                    state.t,
-                    water,
-                    at_rest,
+                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t, water, at_rest
                 )
                 leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": None, "start": None}
                 carried = replace(carried, **leaves)

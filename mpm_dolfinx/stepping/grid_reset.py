@@ -586,7 +586,7 @@ class Assembled(Keyed):
         u = self._nodal
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may depend on time
-        wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None, dt, state.outcome)
+        wet = Wet(on_grid.cut, at, contents, t, data.of_points, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
 
