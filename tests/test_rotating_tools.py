@@ -140,12 +140,12 @@ def test_a_box_tips_over_as_a_rigid_one_on_either_side_alike(tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"spin": 1.0}, "spin, must be given with a mass"),
-        ({"moment": 1.0}, "moment, must be given with a mass"),
+        ({"spin": 1.0}, "spin = 1.0, must be given with a mass"),
+        ({"moment": 1.0}, "moment = 1.0, must be given with a mass"),
         ({"mass": 1.0, "moment": 0.0}, "moment = 0.*must be > 0"),
         ({"mass": 1.0, "spin": np.nan}, "spin = nan"),
         ({"mass": 1.0, "spin": 1.0, "direction": (0, 1)}, "spin = 1, must be 0 for a tool that does not rotate"),
-        ({"mass": 1.0, "centre": (0.6, 1.5)}, "centre, must be the centroid"),
+        ({"mass": 1.0, "centre": (0.6, 1.5)}, r"centre = \(0.6, 1.5\), must be the centroid"),
         (
             {"mass": 1.0, "moment": 1.0, "shape": mpm.HalfSpace((0, 1), (0, -1))},
             "must be given with the centre",
