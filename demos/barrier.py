@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""A bank of clay loses its strength and slides against a rigid barrier: run-out, and force on the barrier.
+"""A bank of clay loses strength and slides against a rigid barrier: run-out, and force on the barrier.
 
-Half of a bank of undrained clay, 10 m high and as long, stands with a vertical side on a rough floor.  Within ten
-minutes its strength c falls from 0.3 to 0.07 gamma H; at 0.26 it would still be stable.  Inertia is neglected.  A
-viscous stress 2 eta D, a term in UFL, limits the velocity and vanishes at rest.  A wall with an adhesion of c / 2 stops
-the clay.
+Half of a bank of undrained clay, 10 m high and 10 m long, stands with a vertical side on a rough floor.  Within ten
+minutes the strength c of the clay falls from 0.3 to 0.07 gamma H; the bank is stable down to 0.26 gamma H.  Inertia is
+neglected.  A viscous stress 2 eta D, a term in UFL, limits the velocity, and vanishes without motion.  A wall with an
+adhesion of c / 2 stops the clay.
 
-At rest the shear stress on any plane is at most c.  Take a wedge between the wall and a plane through its foot, of
-weight W, angle theta and length l.  It bounds the force F normal to the wall.  The shear V on the wall is at most
-c D / 2, with D the depth of clay there:
+After the slide the shear stress on any plane is at most c.  Consider a wedge of weight W between the wall and a plane
+of angle theta and length l through the foot of the wall.  The equilibrium of this wedge bounds the force F normal to
+the wall.  The shear force V on the wall is at most c D / 2, with D the depth of clay at the wall:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
-The largest lower bound is Coulomb's active force, and the smallest upper bound his passive force, for the present
-surface (Culmann 1866).  Planes that end on the axis of symmetry are left out.  The measured force at rest lies between
-both.
+The largest lower bound is Coulomb's active force, and the smallest upper bound is Coulomb's passive force, for the
+deformed surface (Culmann 1866).  Planes that end on the axis of symmetry are omitted.  The computed final force lies
+between the two bounds.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-HEIGHT, LENGTH = 10.0, 26.0  # m: of the bank, also its length; of the floor
-WALL, TOP, THICK = 14.25, 8.0, 1.0  # m: where the barrier stands, its height and thickness
+HEIGHT, LENGTH = 10.0, 26.0  # m: height and length of the bank; length of the floor
+WALL, TOP, THICK = 14.25, 8.0, 1.0  # m: position, height and thickness of the barrier
 WEIGHT = 20e3  # N/m³
 SCALE = WEIGHT * HEIGHT  # Pa
 STRONG, WEAK = 0.3 * SCALE, 0.07 * SCALE  # Pa: strength before and after
 ADHESION = 0.5 * WEAK  # Pa: of the barrier
-DURATION = 600.0  # s, in which it is lost
+DURATION = 600.0  # s, time in which the strength is lost
 VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
 SHEAR = 30 * SCALE
-ANGLES = np.radians(np.linspace(20, 85, 261))  # of the planes of wedges
+ANGLES = np.radians(np.linspace(20, 85, 261))  # angles of the planes of wedges
 
 
 def bank(cells: int, barrier: bool) -> mpm.Simulation:
-    """Return the bank at rest, with a number of cells over its height; t is zero."""
+    """Return the bank in equilibrium at t = 0, with a number of cells over its height."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
     clay = mpm.DruckerPrager(
@@ -53,7 +53,7 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
     s = mpm.Simulation(
         grid, [body], [clay], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)], conditions=tools
     )
-    s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
+    s.run(1e9, 1e9, progress=False)  # time after which viscous stresses are negligible
     s.stage(reset_displacement=True)
     s.t = 0.0
     return s
@@ -63,8 +63,8 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 class Frame:
     """The bank at a time, s.
 
-    corners (n, 4, 2), m; moved (n,), m: displacements of the points; force: normal and along, N/m, and moment about the
-    foot, N, of the clay on the barrier; bounds of the normal force, N/m; depth of the clay at the barrier, m.
+    corners (n, 4, 2), m; moved (n,), m: displacements of the points; force on the barrier (3,): normal and shear force,
+    N/m, and moment about the foot, N; bounds: of the normal force, N/m; depth of the clay at the barrier, m.
     """
 
     t: float
@@ -95,7 +95,7 @@ def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
 
 @dataclass
 class Slump:
-    """A run: the bank after each step; numbers of steps and of cuts."""
+    """A run: the bank after each step, the number of steps, and the number of cut steps."""
 
     frames: list[Frame] = field(default_factory=list)
     steps: int = 0
@@ -116,7 +116,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
         out.frames.append(Frame(s.t, corners, moved, force, between, depth))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the strength at the end of the next step."""
+        """Set the strength that the clay has at the end of the next step."""
         s.stage(fields={"cohesion": STRONG + min(1.0, (s.t + dt) / DURATION) * (WEAK - STRONG)})
 
     def go(t_end: float, dt: float, *observers) -> None:
@@ -167,7 +167,7 @@ def report(out: dict) -> None:
 
 
 def draw(o: Namespace, free: Slump, held: Slump) -> None:
-    """Draw the bank at first contact with the barrier and at rest, with and without it, and the force over time."""
+    """Draw the bank at first contact and at the end, with and without barrier, and the force as a function of time."""
     fig, axes = common.figure(2, 2, (13, 6.6))
     meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
     shown = [

@@ -4,9 +4,9 @@
 The beam of `poroelastic_beam.py` takes 60 steps.  Material points use the default scheme, fixed-stress iterations,
 backward Euler, and adaptive steps.  Body-fitted finite elements are Q1/DG0 on cells of the same size, and
 Taylor-Hood. Both are monolithic with MUMPS, to the same tolerance.  Every case runs `--repeat` times, in turn with
-the others.  The shortest time counts, since other work on the machine only adds.  Compile times are separate.  Errors
-refer to the tip at 0.02 s, at 0.06 s, and from 0.1 s on (largest), against Taylor-Hood elements converged in time
-(`beam.TRUTH`).
+the others.  The shortest time is used, because other work on the machine only increases times.  Compile times are
+separate.  Errors of the tip deflection are given at 0.02 s, at 0.06 s, and as the largest from 0.1 s on.  The reference
+is a solution with Taylor-Hood elements, converged in time (`beam.TRUTH`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def run(name: str, options: str) -> tuple[mpm.Result, float]:
 
 
 def errors(result: mpm.Result) -> list[float]:
-    """Return the tip's relative errors: at 0.02 s, at 0.06 s, and the largest from 0.1 s on; nan after the end."""
+    """Return relative errors of the tip deflection: at 0.02 s, 0.06 s, and largest from 0.1 s on; nan after the end."""
     found = {round(t, 9): u[0, 1] for t, u in zip(result.t, result.displacement, strict=True)}
     off = {t: abs(found.get(t, np.nan) / u - 1) for t, u in zip(beam.TIMES, beam.TRUTH, strict=True)}
     late = [error for t, error in off.items() if t >= 0.1 and error == error]

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Cost of each feature of a scene, measured in a pair of scenes with and without it.
 
-A square block of 1 m between smooth walls is pressed on its top, so little that the active cells stay the same.  In
-each pair one feature is left out, or is present with almost no effect.  Examples are a gravity of zero, a
-conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation without anything to damp.  `settlement`
-is the largest relative difference of the answers.  With mean dilatation it is the difference between the two Poisson
-ratios.
+A square block of 1 m between smooth walls carries a load so small that the active cells do not change.  In each pair
+one scene has no such feature, and in the other scene the feature has almost no effect.  Examples are a gravity of zero,
+a conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation without anything to damp.  `settlement`
+is the relative difference between the final settlements of the two scenes.  In the pair for mean dilatation, this
+difference is caused by different Poisson ratios.
 
-Steps of both scenes alternate, --repeat times.  The shortest of each counts, since other work on the machine only adds.
-The compile time is the extra time of the scene and its first step with an empty cache of compiled forms.  Memory is the
-peak with a full cache.  All times are processor times.
+Steps of both scenes alternate, --repeat times.  The shortest step of each scene is used, because other work on the
+machine only increases times.  The compile time is the additional time for the scene and its first step if the cache of
+compiled forms is empty.  Memory is the peak memory with a full cache.  All times are processor times.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def block(
 
 
 def meshed(grid: mpm.Grid, cells: int):
-    """Return the block's domains as they are, from a mesh."""
+    """Return the block with the same particle domains, made from a mesh."""
     square = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], [1, 1]], [2 * cells] * 2, mesh.CellType.quadrilateral)
     top = np.sort(mesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 1)))
     tags = mesh.meshtags(square, 1, top, np.ones(len(top), dtype=np.int32))
@@ -138,7 +138,7 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """A skeleton whose pressure jumps are evaluated up to four times the flow."""
+    """A skeleton for which pressure jumps are evaluated up to four times the flow that needs no damping."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()
@@ -151,7 +151,10 @@ def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
 
 
 def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
-    """Return the undrained block of plastic soil, with damping of pressure jumps for yielding or elastic soil."""
+    """Return the undrained block of plastic soil.
+
+    yields: damp pressure jumps as in yielding soil; otherwise as in elastic soil.
+    """
     simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
     if not yields:
         simulation.scene.materials._softness.clear()
@@ -175,7 +178,7 @@ LOOSE = {"r": 0.5, "beta": 1e-5, "reference": 1e4}
 
 
 def drying(cells: int, law: type[mpm.ModifiedCamClay], **constants) -> mpm.Simulation:
-    """Return the draining block of overconsolidated clay, whose top gets drier."""
+    """Return the draining block of overconsolidated clay, with suction that increases at the top."""
     p = 1e5  # Pa
     moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk, "conductivity": 1e-8}
     clay = law(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), retention=mpm.VanGenuchten(1e6), **moduli, **constants)
@@ -284,7 +287,7 @@ MAKES = [make for pair in PAIRS.values() for make in pair]
 
 
 def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Result]:
-    """Take some steps; return processor seconds of one, and the result."""
+    """Take some steps; return the processor time of one step, s, and the result."""
     probe = mpm.probes(simulation.bodies, [[0.5, 1.0]])
     observe = [mpm.Writer(simulation, folder)] if folder else []
     end, began = simulation.t + STEPS * DT, time.process_time()
@@ -293,7 +296,7 @@ def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Res
 
 
 def first_step(make: Make, cells: int) -> dict[str, float]:
-    """Return the processor seconds to a scene's first step and the peak memory of this process, MB."""
+    """Return the processor time, s, to the end of a scene's first step, and the peak memory of this process, MB."""
     began = sum(os.times()[:4])  # the C compiler's too
     make(cells).step(DT)
     return {"seconds": sum(os.times()[:4]) - began, "memory": peak_memory()}
@@ -301,7 +304,7 @@ def first_step(make: Make, cells: int) -> dict[str, float]:
 
 @cache
 def compiled(make: Make, cells: int) -> tuple[float, float]:
-    """Return seconds of compilation, and memory of a process that finds all compiled, MB."""
+    """Return the compilation time, s, and the peak memory, MB, of a process that reuses the compiled forms."""
     command = [sys.executable, __file__, "--cells", str(cells), "--one", str(MAKES.index(make))]
     with TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_CACHE_HOME": folder}
@@ -311,7 +314,7 @@ def compiled(make: Make, cells: int) -> tuple[float, float]:
 
 
 def measure(name: str, cells: int, repeat: int) -> dict:
-    """Return the costs of a pair without and with the feature, as lists of two."""
+    """Return the costs of a pair of scenes, as lists: without the feature, with the feature."""
     pair = [make(cells) for make in PAIRS[name]]
     least, tops = [np.inf, np.inf], [0.0, 0.0]
     with TemporaryDirectory() as folder:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Thresholds between linear solvers: both solvers are timed on each side of the thresholds of the plan.
+"""Thresholds between linear solvers: run times of both solvers below and above each threshold.
 
-Each row is a scene of a given number of displacement unknowns.  The threshold is moved so that either solver is used.
-Times are processor times of two steps, the shortest of --repeat runs.  The table is in
+Each row is a scene with a given number of displacement unknowns.  The threshold is changed so that each of the two
+solvers is used.  Times are processor times of two steps, the shortest of --repeat runs.  The table of thresholds is in
 `mpm_dolfinx/solve/solver_choice.py`.
 """
 
@@ -48,7 +48,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
-    """Return the time (s), the number of unknowns and the solver plan of steps with another threshold."""
+    """Return the time of the steps (s), the number of unknowns and the chosen solver, with another threshold."""
     usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
     try:
         s = make(n)

@@ -2,18 +2,18 @@
 """Large deflection of a cantilever under a dead load at its end, until it hangs.
 
 A dry, slender beam of 1 m x 0.05 m, clamped at its left end, carries a dead load P, spread evenly over its right end.
-The load parameter is alpha = P L² / (E I) = 1, 2, 5 and 10, with P per depth and I = height³ / 12.  At the end the
-tip has dropped by 0.81 L and shortened by 0.56 L.  E = 12 MPa and nu = 0, so plane strain equals plane stress.  Of
+The load parameter is alpha = P L² / (E I) = 1, 2, 5 and 10, with P per depth and I = height³ / 12.  Finally the
+tip deflection is 0.81 L, and the shortening 0.56 L.  E = 12 MPa and nu = 0, so plane strain equals plane stress.  Of
 the package's laws, neo-Hooke's is closest to the linear law of a rod: its stress is E (e - e²/2 + ...) at a strain e.
 
-Two references: the elastica (Bisshopp & Drucker 1945), without stretch and shear, and a geometrically exact rod with
-both (Reissner 1972, Simo 1985), with E A, 5/6 G A and E I.  On one process.
+There are two references.  The elastica (Bisshopp & Drucker 1945) has no stretch and shear.  The geometrically exact rod
+(Reissner 1972, Simo 1985) has the stiffnesses E A, 5/6 G A and E I.  On one process.
 
-Errors `v_1` to `v_10` and `u_1` to `u_10`: distance of the tip's deflection v and shortening u from the rod's, over
-L, at each alpha.  With 8 cells over the height and 40 steps: 0.05 %, 0.11 %, 0.13 %, 0.12 % and 0.02 %, 0.07 %, 0.14
-%, 0.16 %. The rod itself contributes 0.01 %, 0.03 %, 0.06 %, 0.08 % and 0.00 %, 0.01 %, 0.05 %, 0.08 %, as converged
-finite elements of the same body show.  The material points converge to these elements, finally with the square of the
-cell size.
+Errors `v_1` to `v_10`, `u_1` to `u_10`: difference of the tip deflection v and of the shortening u from the rod,
+divided by L, at each alpha.  With 8 cells over the height and 40 steps, `v` is 0.05, 0.11, 0.13, 0.12 %, and `u` is
+0.02, 0.07, 0.14, 0.16 %.  Converged finite elements of the same body also differ from the rod: by 0.01, 0.03, 0.06,
+0.08 % in v, and 0.00, 0.01, 0.05, 0.08 % in u.  The material points converge to these elements, finally with second
+order in the cell size.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ BOX = np.array([1.05, 1.0])  # m
 RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)
 STIFFNESS = YOUNG * HEIGHT**3 / 12  # E I per depth, N m
 LOADS = (1, 2, 5, 10)  # alpha
-ARC = np.linspace(0, LENGTH, 41)  # m; places on the axis that are followed
+ARC = np.linspace(0, LENGTH, 41)  # m; arc lengths of the probes on the axis
 
 
 def traction(alpha: float) -> tuple[float, float]:
-    """Return the traction (Pa) on the right end for a load parameter; the load parameter stands for time."""
+    """Return the traction (Pa) on the right end for a load parameter, which takes the place of time."""
     return 0.0, -alpha * STIFFNESS / LENGTH**2 / HEIGHT
 
 
@@ -70,7 +70,7 @@ def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, floa
 
 
 def rod(alpha: float) -> np.ndarray:
-    """Return the rod's axis at the places ARC (m, 2), m."""
+    """Return the axis of the rod (m, 2), m, at the arc lengths ARC."""
     axial, transverse = YOUNG * HEIGHT, 5 / 6 * RUBBER.shear * HEIGHT
     return shear_flexible_rod(LENGTH, axial, transverse, STIFFNESS, -alpha * STIFFNESS / LENGTH**2, points=ARC)
 

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A square cantilever in 3D with a load inclined to the grid: tip, number of load steps, and cost of a step.
+"""A square cantilever in 3D with a load inclined to the grid: tip deflection, number of load steps, cost of a step.
 
 A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5.  A
-square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, as
-the geometrically exact rod with stretch and shear does (Reissner 1972, Simo 1985).  The load parameter is alpha = P
-L² / (E I).  The material is elastic, so the answer must not depend on the number of steps.  This tests the exact
+square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, like
+the geometrically exact rod with stretch and shear (Reissner 1972, Simo 1985).  The load parameter is alpha = P
+L² / (E I).  The material is elastic, so the deflection must not depend on the number of steps.  This tests the exact
 integration of the particle domains.  Runs on any number of processes; --profile prints the cost of a step.
 
-Errors over L: `v` and `u`, distance of the tip's deflection and shortening from the rod's.  `w` is the displacement
-across the load.  `drift` is the largest distance of the tip from its position with the most steps.
+Errors divided by L: `v` of the tip deflection and `u` of the shortening, compared with the rod.  `w` is the
+displacement normal to the plane of bending.  `drift` is the largest distance of the tip from the tip in the run with
+most steps.
 
-The tip moves too far because the stress is constant in each domain: with n domains over the height, by 1/n².
-`v` with 2, 4 and 8 cells (n = 4, 8, 16), in 10 steps: 0.0129, 0.0034, 0.0010; in the plane 0.0127, 0.0033, 0.0010.
+The tip deflection is too large because the stress is constant in each domain.  With n domains over the height the error
+is about 1/n².  In 10 steps with 2, 4 and 8 cells (n = 4, 8, 16), `v` is 0.0129, 0.0034, 0.0010 in 3D, and 0.0127,
+0.0033, 0.0010 in plane strain.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ LENGTH, SIDE, YOUNG = 1.0, 0.1, 12e6  # m, m, Pa
 ALONG, ACROSS = np.array([0, 3, -4]) / 5, np.array([0, 4, 3]) / 5
 RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)  # nu = 0
 STIFFNESS = YOUNG * SIDE**4 / 12  # E I, N m²
-OFFSET = np.array([0, 0.37, 0.5])  # of the beam from the grid lines, cells
+OFFSET = np.array([0, 0.37, 0.5])  # offset of the beam from the grid lines, cells
 
 
 def rod(alpha: float) -> tuple[float, float]:
@@ -60,7 +62,7 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
 
 
 def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
-    """Return the tip's displacement (3,), m, the result and the costs of a run; only `taken` of the steps."""
+    """Return the tip displacement (3,), m, the result and the costs of a run; taken: number of steps to take."""
     simulation, tip = scene(cells, alpha)
     result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
     comm, (on_grid, matrices) = simulation.grid.comm, simulation.scene.last
@@ -81,7 +83,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces (m, 4, 3) of the body's domains, m, and their stretch along the beam."""
+    """Return the faces (m, 4, 3), m, of the body's domains, and the axial stretch of each."""
     (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):
@@ -98,9 +100,9 @@ def main(argv: list[str] | None = None) -> dict:
     add = parser.add_argument
     add("--cells", type=int, default=4, help="cells over the height")
     add("--steps", type=int, nargs="+", default=[10, 20, 40], help="numbers of load steps")
-    add("--taken", type=int, default=None, help="take only so many of the steps: no errors, but costs")
+    add("--taken", type=int, default=None, help="take only this number of steps: prints costs, no errors")
     add("--alpha", type=float, default=1.0, help="load parameter")
-    add("--profile", action="store_true", help="print where the time went")
+    add("--profile", action="store_true", help="print the run time of each part of the program")
     o = parser.parse_args(argv)
     if o.cells < 1 or min(o.steps) < 1 or not 0 < o.alpha <= 10:
         parser.error(f"--cells {o.cells} --steps {o.steps} --alpha {o.alpha}: must be >= 1, >= 1 and in (0, 10]")
@@ -124,7 +126,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
-    """Return the errors that the module's docstring defines, of the run with most steps."""
+    """Return the errors of the run with most steps, see the module's docstring."""
     u, v = rod(alpha)
     tip = tips[-1]
     drift = np.linalg.norm(tips - tip, axis=1).max()
@@ -142,7 +144,7 @@ def report(o: Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, faces: np.ndarray, stretch: np.ndarray) -> None:
-    """Draw the deformed beam, coloured by the stretch along it."""
+    """Draw the deformed beam, coloured by the axial stretch."""
     import matplotlib.pyplot as plt
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize

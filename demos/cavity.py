@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Expansion of a cylindrical cavity in clay and in sand, on a grid of squares.
 
-A quarter of a ring of soil has b = 5 a0.  The wall moves by a fifth of a cell in each step, and by a tenth in undrained
-soil, because laws with history are integrated to first order.  With eight cells and steps of a fifth of a cell, the
-radial solution itself has pore pressures 1.5 % too low at a = 1.1 a0 in yielding normally consolidated clay.
+The body is a quarter of a ring, with initial radius a0 of the cavity and outer radius b = 5 a0.  In each step the wall
+moves by a fifth of a cell, in undrained soil by a tenth.  Such small steps are needed because laws with history are
+first-order accurate in the step.  With eight cells and steps of a fifth of a cell, the radial solution itself has an
+error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
-1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water flows.  The outside
-   keeps its initial pressure.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
-2. Then the wall is fixed and the clay drains at its outside: its excess pressures dissipate.
+1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, expanded so fast that no water flows.  The
+   initial pressure acts on the outer boundary.  In incompressible soil the motion is exact: r^2 - a^2 = R^2 - a0^2.
+2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
 3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
    degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
    outside of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
-Pressures are over p_0.  Errors are relative, at the marks.
+Pressures are divided by p_0.  Errors are relative, at the radii `MARKS`.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ import numpy as np
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.cavity import cavity, undrained
 
-P0, OUTER = 1e5, 5.0  # Pa, outer radius over that of the cavity
-PUSH, PUSH_UNDRAINED = 0.2, 0.1  # of a cell, in a step
+P0, OUTER = 1e5, 5.0  # Pa, outer radius divided by that of the cavity
+PUSH, PUSH_UNDRAINED = 0.2, 0.1  # fraction of a cell in each step
 CLAY = mpm.ModifiedCamClay(
     M=1.2, lambda_=0.0726, kappa=0.0145, shear=30 * P0, initial_stress=(-P0,) * 3, conductivity=1e-9
 )
@@ -40,7 +41,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, with indices of v over the Cauchy stress."""
+    """Return the clay of Chen and Abousleiman, with lambda and kappa in terms of v and the Cauchy stress."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
@@ -51,8 +52,8 @@ def well() -> mpm.ModifiedCamClay:
 class Drained:
     """A drained cavity in infinite soil.
 
-    soil, state: the soil and its initial state; known: radius -> pressure over p_0; reach: radius of the radial
-    solution.
+    soil, state: the soil and its initial state variables; known: radius -> pressure divided by p_0; reach: outer radius
+    of the radial solution.
     """
 
     soil: mpm.Skeleton
@@ -61,7 +62,7 @@ class Drained:
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
-PRESSED = {"plastic": np.exp(-2 * P0 / (3 * SAND.bulk)) * np.eye(3)}  # sand begins with its pressure as elastic strain
+PRESSED = {"plastic": np.exp(-2 * P0 / (3 * SAND.bulk)) * np.eye(3)}  # initial pressure of sand, as elastic strain
 DRAINED = {
     "well": Drained(well(), {1.02: 2.0685, 1.08293: 2.8928, 1.5: 4.4063}, 100.0),
     "sand-0": Drained(SAND, {1.02: 2.812, 1.1: 4.489, 1.5: 6.531}, state=PRESSED),
@@ -77,9 +78,9 @@ def ray(X: np.ndarray) -> np.ndarray:
 
 
 def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
-    """Return a quarter of the ring, with a number of cells over the radius of the hole; the radius is 1 + t.
+    """Return a quarter of the ring, with a number of cells over the radius of the cavity; this radius is 1 + t, m.
 
-    outside: displacement of the outer boundary, m, as a function of time; widest: the largest radius of the hole.
+    outside: displacement of the outer boundary, m, as a function of time; widest: the largest radius of the cavity.
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
@@ -99,19 +100,19 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the hole to a radius, m, by a fraction of a cell per step; return the total pressure in it over p_0."""
+    """Widen the cavity to a radius, m, by a fraction of a cell per step; return its total pressure divided by p_0."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)
 
 
 def pressure(s: mpm.Simulation, radius: float) -> float:
-    """Return the pressure in the hole over p_0."""
+    """Return the cavity pressure divided by p_0."""
     return float(s.reactions["hole"].mean() / radius / P0)
 
 
 def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
-    """Return radius -> pressures over p_0: in the hole, and of the radial solution."""
+    """Return radius -> cavity pressures divided by p_0: computed, and of the radial solution."""
     case = DRAINED[name]
     widest = max(case.known)
     reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
@@ -130,8 +131,9 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 class Undrained:
     """Results of an undrained expansion and of the consolidation after it.
 
-    total, water: radius -> pressure in the hole minus p_0, and pore pressure at its wall, over p_0, and the exact
-    values; profiles: (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
+    total: radius -> cavity pressure minus p_0, computed and exact; water: radius -> pore pressure at the wall, computed
+    and exact; profiles: (time after the expansion, s, radii of the points, m, pore pressures).  All pressures are
+    divided by p_0.  balance: error of the fluid balance.
     """
 
     total: dict[float, tuple[float, float]]
@@ -141,14 +143,14 @@ class Undrained:
 
 
 def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
-    """Return the pore pressure over p_0 at the wall, linear in ln r through two cells, as in yielding soil."""
+    """Return the pore pressure at the wall divided by p_0, extrapolated from two cells, linear in ln r."""
     r = np.linalg.norm(s.points.x, axis=1)
     near = r < radius + 2 * h
     return float(np.polyfit(np.log(r[near] / radius), s.points.pressure[near] / P0, 1)[-1])
 
 
 def push(OCR: float, cells: int) -> Undrained:
-    """Widen the hole in clay to the last of `MARKS`, fast, then let the clay drain."""
+    """Widen the cavity in clay fast to the last of `MARKS`, then let the clay drain."""
     soil = replace(CLAY, OCR=OCR, bulk=None)
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Pressure("right", P0), mpm.Drained("right")]}
     widest = MARKS[-1]
@@ -180,8 +182,8 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius")
-    parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained ones")
-    parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation, undrained")
+    parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained cases")
+    parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation ratios, undrained")
     o = parser.parse_args(argv)
     if o.cells < 2 or any(not 1 <= ratio < 10 for ratio in o.ratios):
         parser.error(f"--cells {o.cells} --ratios {o.ratios}: must be >= 2, and in [1, 10)")
@@ -211,7 +213,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
-    """Draw pressures in drained cavities, and pore pressures around undrained ones as they dissipate."""
+    """Draw pressures in drained cavities, and dissipating pore pressures around undrained cavities."""
     from matplotlib.cm import viridis
 
     fig, ((left, right),) = common.figure(1, 2, (12, 4.2))

@@ -2,15 +2,15 @@
 """Columns of dry sand collapse: run-out and height against published experiments, and energies.
 
 Columns of width L and height a L, a = 0.5, 1, 4 and 8, stand against a smooth wall on a rough floor.  Their right side
-is released at once.  Lube et al. (2005) found for sand, sugar and rice in a channel, with angles of repose near 31
-degrees, that the front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
+is released suddenly.  Lube et al. (2005) measured sand, sugar and rice in a channel, with angles of repose near 31
+degrees.  The front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
 
-The sand follows Mohr and Coulomb's law without dilation.  In simple shear it bears sin phi of the normal stress (Davis
-1968), so sin phi = tan 31 degrees.  Grains of d = L/100 add a viscosity, as friction in fast flow grows by 0.93 I with
-the inertial number I (Jop, Forterre and Pouliquen 2006): 0.93 d sqrt(p rho_s), at the pressure p in the middle of a
-heap of half the height.  A constant viscosity is as good as a local one (Ionescu et al. 2015).  Without it shear
-localises in single cells, and energy is lost there.  The front is the point at which the depth of the sand is one
-grain.
+The sand follows the Mohr-Coulomb law without dilation.  In simple shear its shear strength is sin phi times the normal
+stress (Davis 1968), so sin phi = tan 31 degrees.  In fast flow the friction coefficient grows by 0.93 I, with the
+inertial number I (Jop, Forterre and Pouliquen 2006).  For a grain size d = L/100 this is equivalent to a viscosity of
+0.93 d sqrt(p rho_s).  p is the pressure in the middle of a heap of half the height.  A constant viscosity is as good as
+a local viscosity (Ionescu et al. 2015).  Without viscosity, shear localises in single cells and dissipates energy
+numerically.  The front is the point at which the depth of the sand is one grain.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011),
 J. Fluid Mech. 686, 378.
@@ -27,16 +27,16 @@ import numpy as np
 import mpm_dolfinx as mpm
 
 GRAVITY, DENSITY, REPOSE = 9.81, 1560.0, np.radians(31.0)  # m/s², kg/m³, -
-STIFF, COHESION = 200.0, 1e-3  # Young's modulus and cohesion over the weight of the column
+STIFF, COHESION = 200.0, 1e-3  # Young's modulus and cohesion, divided by rho g H
 GRAIN, RISE = 0.01, (0.64 - 0.38) / 0.279  # m; (mu_2 - mu_s) / I_0 of Jop et al.
-FALLS, SHOWN = 3.5, np.array([0.5, 1.0, 1.5, 2.0])  # duration, and times of the profiles, in sqrt(H/g)
-CELLS = {0.5: 12, 1.0: 8, 4.0: 4, 8.0: 4}  # over the width, for each aspect
-SCATTER, BALANCE = 0.15, 0.02  # of the experiments; of the work of the weight
+FALLS, SHOWN = 3.5, np.array([0.5, 1.0, 1.5, 2.0])  # duration, and times of the profiles, in units of sqrt(H/g)
+CELLS = {0.5: 12, 1.0: 8, 4.0: 4, 8.0: 4}  # cells over the width, for each aspect ratio
+SCATTER, BALANCE = 0.15, 0.02  # fraction of the experimental run-out; of the work of the weight
 STEPS = 50  # in sqrt(H/g)
 
 
 class Heap(NamedTuple):
-    """Run-out and height, m, lost and kinetic energy over the work, profiles in motion, and the run.
+    """Run-out and height, m; energy loss and kinetic energy divided by the work of the weight; profiles; the run.
 
     before, after: corners of the domains, m; profiles: middles of strips, m, and depths of sand in them, m.
     """
@@ -52,12 +52,12 @@ class Heap(NamedTuple):
 
 
 def published(aspect: float) -> float:
-    """Return the run-out over the width by Lube et al., interpolated linearly between their laws."""
+    """Return the run-out of Lube et al., divided by the width; linear between the ranges of their two laws."""
     return float(np.interp(aspect, (1.8, 2.8), (0, 1)) * (1.9 * aspect ** (2 / 3) - 1.2 * aspect) + 1.2 * aspect)
 
 
 def column(aspect: float, cells: int, grain: float = GRAIN) -> mpm.Simulation:
-    """Return a column at rest, 1 m wide, with cells over its width; grain: size of the grains, m."""
+    """Return a column at rest, 1 m wide, with a number of cells over the width; grain: grain size, m."""
     h, reach = 1 / cells, np.ceil(1.4 * published(aspect) + 2.5)
     grid = mpm.Grid([0, 0], [reach, aspect + 2 * h], [round(reach * cells), round(aspect * cells) + 2])
     weight = DENSITY * GRAVITY * aspect
@@ -90,7 +90,7 @@ def depths(s: mpm.Simulation, h: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN) -> Heap:
-    """Release a column and return its `Heap`.  steps: in the time sqrt(H/g); grain: see `column`."""
+    """Release a column and return its `Heap`.  steps: number of steps in the time sqrt(H/g); grain: see `column`."""
     s = column(aspect, cells, grain)
     fall = np.sqrt(aspect / GRAVITY)
     before, profiles = s.points.corners.copy(), []
@@ -113,10 +113,10 @@ def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN) -> 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--aspects", type=float, nargs="+", default=list(CELLS), help="heights over the width")
-    parser.add_argument("--finer", type=float, default=1.0, help="times as many cells over the width")
+    parser.add_argument("--aspects", type=float, nargs="+", default=list(CELLS), help="height-to-width ratios")
+    parser.add_argument("--finer", type=float, default=1.0, help="factor for the number of cells over the width")
     parser.add_argument("--steps", type=float, default=STEPS, help="steps in sqrt(H/g)")
-    parser.add_argument("--grain", type=float, default=GRAIN, help="size of grains over the width, 0: no viscosity")
+    parser.add_argument("--grain", type=float, default=GRAIN, help="grain size divided by the width; 0: no viscosity")
     o = parser.parse_args(argv)
     if not all(0.25 <= a <= 16 for a in o.aspects):
         parser.error(f"--aspects {o.aspects}: must be in [0.25, 16]")

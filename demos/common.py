@@ -22,7 +22,7 @@ import mpm_dolfinx as mpm
 
 GALLERY = Path(__file__).with_name("README.md")
 COLOURS = "#0072B2 #E69F00 #009E73 #D55E00 #CC79A7 #56B4E9 #882255 #7F7F7F #999933 #332288".split()
-"""Colours of lines, in order: also the colour-blind can tell them apart (Okabe and Ito 2008, Tol 2021)."""
+"""Colours of lines, in order, also distinct for the colour-blind (Okabe and Ito 2008, Tol 2021)."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -32,7 +32,7 @@ class Parser(argparse.ArgumentParser):
     """
 
     class Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-        """The description as it is written, defaults behind the options."""
+        """Help text with unchanged line breaks, and the default of each option."""
 
     def __init__(self, description: str, file: str, writes: bool = True, processes: bool = False):
         super().__init__(description=description, formatter_class=self.Formatter)
@@ -54,7 +54,7 @@ class Parser(argparse.ArgumentParser):
         return o
 
     def refuse_processes(self, what: str = "") -> None:
-        """End a demo on several processes: its output would cover a part of the points only."""
+        """End a demo on several processes, because the output would contain only a part of the points."""
         if (size := MPI.COMM_WORLD.size) == 1:
             return
         if not first():
@@ -64,9 +64,9 @@ class Parser(argparse.ArgumentParser):
 
 @contextmanager
 def results(o: argparse.Namespace) -> Iterator[dict]:
-    """Yield the results, which the demo fills; print the run time before, and the results after the run (--json).
+    """Yield a dict for the results of the demo; print the run time before, and the results (--json) after the run.
 
-    A run that gives up (`mpm.GaveUp`) ends with a line.  Then `converged` is False, and earlier results are kept.
+    A run that fails (`mpm.GaveUp`) prints one line.  Then `converged` is False, and earlier results remain.
     """
     out, start = {}, time.perf_counter()
     if first() and o.takes:
@@ -100,7 +100,7 @@ def whole(s: mpm.Simulation, *names: str) -> list[np.ndarray]:
 
 
 def table(rows: Iterable[Iterable[str]]) -> None:
-    """Print rows of text, the head first, in columns as wide as their entries; the first column is left-aligned."""
+    """Print rows of text, the head first, in aligned columns; the first column is left-aligned."""
     rows = [list(row) for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for name, *entries in rows:
@@ -135,7 +135,7 @@ def figure(rows: int, columns: int, size: tuple[float, float]):
 
 
 def save(fig, path: Path, dpi: int = 130) -> None:
-    """Write a figure as a picture of at most 256 colours, which makes it a third as large."""
+    """Write a figure as a picture of at most 256 colours, with a third of the file size."""
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -155,7 +155,7 @@ def weight(unit_weight: float) -> Callable:
 
 
 def viscous(viscosity: float) -> Callable:
-    """Return the term, a potential, of the stress 2 eta D of the rate of strain D = sym grad u / dt; eta in Pa s."""
+    """Return the potential of a viscous stress 2 eta D, eta in Pa s, with the strain rate D = sym grad u / dt."""
 
     def viscous(points, u, dt):
         strain = ufl.sym(points.grad(u))

@@ -2,17 +2,18 @@
 """Iterations of the coupling between displacement and pore pressure, from drained to undrained.
 
 The linear systems of Newton's first step are solved to 1e-8 (true residual).  Scenes are a cantilever (the poroelastic
-beam, at rest and bent) and a footing on a column.  Only the product of conductivity and step matters.  This product
-ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the water ranges from 1e4 Pa to
-infinity.
+beam, undeformed and bent) and a footing on a column.  Only the product of conductivity and step length matters.  This
+product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the water ranges from
+1e4 Pa to infinity.
 
-Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with
-the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C + beta V.  The
-third is the plain fixed-stress (Richardson) iteration with beta = 0.5, 0.75 and 1 times alpha²/K_dr, and with 1/K_w,
-which diverges.  An iteration is one solve of the storage and one of the momentum.
+Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T. The
+preconditioner is the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C
++ beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson) iteration, with beta = 0.5, 0.75
+and 1 times alpha²/K_dr.  With beta = 1/K_w this iteration diverges.  An iteration consists of one solve of the storage
+and one solve of the momentum.
 
 Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
-bounds these modes, and with them the number of iterations.  The second picture shows the pressure with and without
+limits these modes, and thereby also the number of iterations.  The second picture shows the pressure with and without
 damping.
 """
 
@@ -45,9 +46,9 @@ SCHEMES = {
     "fixed stress, 1": ("richardson", 1.0, 0.0),
     "fixed stress, 1/K_w": ("richardson", None, 0.0),
 }
-"""Krylov method, multiple of alpha^2/K_dr taken as beta (None: 1/K_w), share of the filter."""
-MOST = 200  # iterations before a scheme is given up
-RAMP_STEP = 0.02  # s: every system has the load increment of this time, whatever its dt
+"""Krylov method; beta divided by alpha^2/K_dr (None: beta = 1/K_w); factor of the filter L."""
+MOST = 200  # iterations after which a scheme counts as divergent
+RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt
 CLEAR = 0.1  # m from the corners of the clamp, where the pressure is singular
 GOAL = 15  # iterations
 
@@ -65,7 +66,10 @@ LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
 
 @dataclass(frozen=True)
 class Count:
-    """Iterations of a scheme for one system: None if it diverges; lowest, highest: eigenvalues of P^-1 S (CG)."""
+    """Number of iterations of a scheme for one linear system; None if the scheme diverges.
+
+    lowest, highest: extreme eigenvalues of P^-1 S (CG only).
+    """
 
     scene: str
     h: float
@@ -83,7 +87,7 @@ def cantilever(h: float) -> mpm.Simulation:
 
 
 def bent(h: float) -> mpm.Simulation:
-    """Return the poroelastic beam after two steps, its tip deflected by half its height."""
+    """Return the poroelastic beam after two steps, with a tip deflection of half its height."""
     simulation = cantilever(h)
     simulation.run(2 * RAMP_STEP, RAMP_STEP, progress=False)
     return simulation
@@ -135,7 +139,10 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 
 
 def linearise(s: mpm.Simulation, dt: float) -> System:
-    """Return the first linear system of a step of dt, at the load of the next RAMP_STEP."""
+    """Return the first Newton system of a step of length dt, s.
+
+    The load is that after RAMP_STEP, for any dt.
+    """
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
@@ -170,7 +177,7 @@ def count(s: System, scheme: str) -> tuple[int | None, float, float]:
 
 
 def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) -> list[Count]:
-    """Count the iterations of the schemes over the range of fluids and of k dt."""
+    """Count the iterations of the schemes for all fluids and all values of k dt."""
     start, out = SCENES[scene](h), []
     for bulk in bulks:
         s = with_water(start, bulk)
@@ -181,7 +188,7 @@ def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) ->
 
 
 def worst(counts: list[Count]) -> float:
-    """Return the largest number of iterations of some counts; infinite if one diverges or takes more than MOST."""
+    """Return the largest number of iterations; infinite if a scheme diverges or takes more than MOST iterations."""
     return max(np.inf if c.iterations is None else c.iterations for c in counts)
 
 
@@ -215,7 +222,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, nargs="+", default=[0.06, 0.03, 0.015], help="cell sizes, m")
-    parser.add_argument("--quick", action="store_true", help="coarser: every other k dt, hard water only")
+    parser.add_argument("--quick", action="store_true", help="fewer cases: every other k dt, stiff water only")
     o = parser.parse_args(argv)
     if not min(o.h) > 0:
         parser.error(f"--h {min(o.h)}: must be > 0")
@@ -243,7 +250,7 @@ def shown(iterations: float) -> str:
 
 
 def write(o: Namespace, counts: list[Count]) -> None:
-    """Write all counts as CSV, and the worst of each scene and cell size as Markdown."""
+    """Write all counts as CSV, and the largest count for each scene and cell size as Markdown."""
     head = ["scene", "h_m", "fluid_bulk_Pa", "k_dt_m", "scheme", "iterations", "lowest", "highest"]
     common.write_csv(o.out / "iterations.csv", head, (asdict(c).values() for c in counts))
     rows = [["scene", "h (m)", *SCHEMES, "eigenvalues of P⁻¹S"]]

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Cryer's sphere: loaded all around and drained at its surface, with a rise of pressure at its centre.
+"""Cryer's sphere: loaded and drained at its surface, with a rise of pressure at the centre.
 
-A saturated sphere is loaded at once by a constant normal traction p0, and its surface is drained.  The outer shell
+A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained.  The outer shell
 drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
 falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Fluid and grains are incompressible,
 nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the sphere; with --axisymmetric, a quarter
 of a disc.
 
-Errors of the pressure at the centre at reduced times T = c_v t / R²: `peak` is the relative error of its largest value,
-`curve` the largest error from T = 0.02 on, over p0.
+Errors of the pressure at the centre, with the reduced time T = c_v t / R²: `peak` is the relative error of the largest
+pressure; `curve` is the largest error from T = 0.02 on, divided by p0.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ WATER = mpm.Fluid(bulk=np.inf)
 CV = CONDUCTIVITY / WATER.unit_weight * SAND.oedometric  # m²/s
 END = 0.12  # reduced time
 CUBE = 0.8 * RADIUS  # m; edge of the lattice: an octant has the volume of a cube of 0.81 R
-SQUARE = 0.85 * RADIUS  # m; edge of that of a quarter disc
+SQUARE = 0.85 * RADIUS  # m; edge of the lattice of a quarter disc
 OUTER = ("right", "back", "top")  # sides of the lattice that become the surface of the ball
 
 
 def ball(x: np.ndarray) -> np.ndarray:
-    """Return where a map from the cube [-CUBE, CUBE]^3 onto the ball takes positions (n, 3), m; planes x = 0 stay."""
+    """Map positions (n, 3), m, from the cube [-CUBE, CUBE]^3 to the ball; planes of symmetry do not move."""
     a = x / CUBE
     b, c = np.roll(a, -1, axis=1) ** 2, np.roll(a, -2, axis=1) ** 2
     return RADIUS * a * np.sqrt(1 - b / 2 - c / 2 + b * c / 3)
 
 
 def disc(x: np.ndarray) -> np.ndarray:
-    """Return where a map from the square [-SQUARE, SQUARE]^2 onto the disc takes positions (n, 2), m."""
+    """Map positions (n, 2), m, from the square [-SQUARE, SQUARE]^2 to the disc."""
     a = x / SQUARE
     return RADIUS * a * np.sqrt(1 - a[:, ::-1] ** 2 / 2)
 
@@ -64,7 +64,7 @@ def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
 
 @dataclass
 class Outcome:
-    """Reduced times (m,), pressures at the centre over p0 (m,), and the cost of the run."""
+    """Reduced times (m,), pressures at the centre divided by p0 (m,), and the cost of the run."""
 
     T: np.ndarray
     pressure: np.ndarray
@@ -91,7 +91,7 @@ def run(cells: int = 20, steps: int = 100, axisymmetric: bool = False) -> tuple[
 
 
 def exact(T: np.ndarray) -> np.ndarray:
-    """Return the exact pressure at the centre over p0 at reduced times."""
+    """Return the exact pressure at the centre divided by p0, at reduced times."""
     return cryer_pressure(T, 1.0, 1.0, NU)
 
 
@@ -108,10 +108,10 @@ def errors(out: Outcome) -> dict[str, float]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
-    parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
+    parser.add_argument("--cells", type=int, default=20, help="cells over the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")
     parser.add_argument("--axisymmetric", action="store_true", help="a quarter of a disc instead of the octant")
-    parser.add_argument("--profile", action="store_true", help="print where the time went")
+    parser.add_argument("--profile", action="store_true", help="print the run time of each part of the program")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 2 and >= 1")

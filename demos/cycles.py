@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
-The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly.  It is elastic, so it must be free of
-stress without load.  The grid's displacements have kinks at grid lines.  Domains that follow these kinks would
-collect stress with every line that they cross, as the points of standard MPM do.
+The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly.  The beam is elastic, so its stress must
+vanish after unloading.  Displacements of the grid have kinks at grid lines.  Domains that follow these kinks would
+accumulate stress with every grid line that they cross, like the points of standard MPM.
 
-A block is stretched between two fixed sides and then rotated by 360 degrees.  It must end with its initial stresses.
+A block is stretched between two fixed sides and then rotated by 360 degrees.  Its final stresses must equal the
+stresses before the rotation.
 
-The undrained beam has singular edges at its clamp.  The stress there is singular as r^(x - 1), with cos(pi x / 2) = x,
-x = 0.595 (Williams 1952).  Its rms within a few cells of the edges falls as h^x, and so does the residual stress.  The
-results are for the whole beam, far from the clamp, near it, and with springs in its place.
+The undrained beam has singular edges at the clamp.  Near these edges the stress grows as r^(x - 1), with cos(pi x / 2)
+= x, x = 0.595 (Williams 1952).  The rms stress within a few cells of the edges decreases as h^x, and so does the
+residual stress.  Results are given for the whole beam, far from the clamp, near the clamp, and with springs instead of
+the clamp.
 """
 
 from __future__ import annotations
@@ -26,10 +28,10 @@ import poroelastic_beam as beam
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-STRETCH = 0.1  # of the block, before it turns
+STRETCH = 0.1  # stretch of the block before its rotation
 BLOCK = 1.0  # m
-AWAY = 0.1  # m, from the wall: where the edges of the clamp do not tell
-SPRINGS = 5e7  # Pa/m, in place of the clamp: as stiff as a third of the beam, for nothing singular
+AWAY = 0.1  # m: distance from the wall without influence of the singular edges
+SPRINGS = 5e7  # Pa/m: springs instead of the clamp, as stiff as a third of the beam, without singularity
 COLORS = ("C1", "C0", "C2", "C4", "C5")  # of the cell sizes
 
 
@@ -46,7 +48,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the root mean square of the points' stress, Pa, with zero for points nearer to the wall than `away`."""
+    """Return the rms stress of the points, Pa, with zero for points nearer to the wall than `away`, m."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -74,11 +76,11 @@ def cycle(
     cycles, steps
         Cycles, and steps in each, even.
     quadrature
-        Of the material points.
+        Quadrature at the material points, see `mpm.Numerics`.
     material
-        By default that of the beam.
+        Material of the body; by default the material of the beam.
     seed
-        Returns the body, called with grid, lower and upper corner, and points per cell and direction.
+        Function that returns the body, with the arguments grid, lower and upper corner, points per cell and direction.
     fluid
         Pore fluid; the beam is undrained.
     springs
@@ -87,9 +89,10 @@ def cycle(
 
     Returns
     -------
-    left: rms of the stress after each cycle over that at the first peak; away: the same without points near the wall;
-    times, tips (m): time and tip deflection of each step; lost: work of the load in each cycle over the work up to the
-    first peak; volume: volume change of the beam minus that of its water; balance: error of the fluid balance.
+    left: rms stress after each cycle, divided by that at the first peak; away: the same without points
+    near the wall; times, tips (m): time and tip deflection of each step; lost: work of the load in each cycle, divided
+    by the work up to the first peak; volume: volume change of the beam minus that of its water; balance: error of the
+    fluid balance.
     """
     o = options(h, load, quadrature)
     cells = np.rint(beam.BOX / h).astype(int)
@@ -180,7 +183,7 @@ def orders(h: list[float], left: list[float]) -> list[float]:
 
 
 def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deflection of the tip (m) in a cycle by finite elements, and the load (Pa)."""
+    """Return the tip deflection (m) in a load cycle, computed with finite elements, and the load (Pa)."""
     case = options(o.h[-1], o.load)
     size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
     fem = BiotFEM(*size, beam.material(case), **conditions(case))
@@ -192,7 +195,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
-        "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; standard MPM: the last"
+        "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; the last is also used for standard MPM"
     )
     parser.add_argument("--load", type=float, default=54e3, help="largest load, Pa")
     parser.add_argument("--cycles", type=int, default=20, help="load cycles")
@@ -202,7 +205,7 @@ def main(argv: list[str] | None = None) -> dict:
         type=float,
         nargs="*",
         default=[0.05, 0.025],
-        help="cell sizes of the block, m; last one undrained too",
+        help="cell sizes of the block, m; the last also undrained",
     )
     parser.add_argument("--undrained", type=int, default=20, help="load cycles of the undrained beam; 0: none")
     o = parser.parse_args(argv)

@@ -2,18 +2,19 @@
 """A dam: seepage with a free surface during drawdown of the reservoir, in unsaturated soil.
 
 A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
-reservoir, 5 m.  Then the other slope becomes permeable, and the flow becomes steady.  After that the reservoir falls by
-2 m in five days, and the free surface, p = 0, follows as the soil drains.  Above it water flows under suction
-(`mpm.VanGenuchten`).  The reservoir loads the wet slope.  Above the water, both slopes are seepage faces.
+reservoir, 5 m.  Then the downstream slope becomes permeable, and the flow becomes steady.  Finally the reservoir falls
+by 2 m in five days, and the free surface, p = 0, falls more slowly as the soil drains.  Above the free surface, water
+flows under suction (`mpm.VanGenuchten`).  The reservoir loads the upstream slope.  Above the water levels, both slopes
+are seepage faces.
 
 Checks:
 
-* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
-  water at its sides, and water at rest above.  The exact flow is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with
-  Kirchhoff's potential, the integral of k_r over the head, in place of the head;
-* `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
-* `drained`: ratio of the outflow of a column to that of finite elements on cells a quarter as large.  Its free surface
-  falls from 8 m towards 2 m.
+* `flow`: outflow of a rectangular dam, divided by the exact outflow.  The dam is 9.6 m wide, with water levels of 10 m
+  and 2 m, and hydrostatic suction on its sides above these levels.  The exact flow is k (H1^2 - H2^2) / (2 L) (Dupuit,
+  Charny).  Here Kirchhoff's potential, the integral of k_r over the head, replaces the head;
+* `steady`: inflow of the dam divided by its outflow, before the reservoir falls;
+* `drained`: outflow of a column, divided by the outflow of finite elements on cells of a quarter of the size.  The free
+  surface of the column falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ import numpy as np
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-HEIGHT, CREST, SLOPE = 6.0, 3.0, 2.0  # m, m, run over rise
+HEIGHT, CREST, SLOPE = 6.0, 3.0, 2.0  # m, m, slope: run divided by rise
 BASE = CREST + 2 * SLOPE * HEIGHT
-LEVELS = (5.0, 3.0)  # m: of the reservoir, before and after
+LEVELS = (5.0, 3.0)  # m: level of the reservoir, before and after the fall
 WEIGHT = 9810.0  # N/m^3
 LOAM = mpm.LinearElastic(
     bulk=1e9,
@@ -40,15 +41,15 @@ LOAM = mpm.LinearElastic(
     retention=mpm.VanGenuchten(WEIGHT / 2, residual=0.15, n=2.0),
 )
 DAY = 86400.0  # s
-SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: steps until the flow is steady
-FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: of the reservoir's fall; after it began, when the free surface is drawn
+SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: periods of equal steps until the flow is steady
+FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since its start, for the picture
 
 
 @dataclass
 class Dam:
-    """Flows, corners and pressures in steady flow and at each of `SEEN`.
+    """Flows, corners and pressures in steady flow and at each time of `SEEN`.
 
-    flows: (2,), m^2/s, out of both slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
+    flows: (2,), m^2/s, out of the two slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
     """
 
     flows: list[np.ndarray] = field(default_factory=list)
@@ -70,7 +71,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Lower the reservoir of the dam on cells of size h, m, with a number of steps for each length and for the fall."""
+    """Lower the reservoir of a dam on cells of size h, m; steps: number in each period, and in the fall."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -109,7 +110,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
 
 def rectangular(cells: int) -> float:
-    """Return the ratio of the flow through a rectangular dam to the exact flow."""
+    """Return the flow through a rectangular dam, divided by the exact flow."""
     levels, width, top = (10.0, 2.0), 9.6, 12.0
     h = top / cells
     grid = mpm.Grid([0, 0], [width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])
@@ -135,7 +136,7 @@ def rectangular(cells: int) -> float:
 
 
 def driving(level: float, top: float) -> float:
-    """Return the integral of Kirchhoff's potential over the height, m^2, for water at rest about a level, m."""
+    """Return the integral of Kirchhoff's potential over the height, m^2, for hydrostatic water with a level, m."""
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
     k_r = filled**law.l * (1 - (suction * WEIGHT / law.entry) ** (law.n - 1) * filled) ** 2
@@ -168,7 +169,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
-    parser.add_argument("--steps", type=int, default=10, help="steps of each length, and of the fall")
+    parser.add_argument("--steps", type=int, default=10, help="steps in each period until steady flow, and in the fall")
     parser.add_argument(
         "--cells", type=int, default=40, help="cells over the height of the rectangular dam, and of the column"
     )

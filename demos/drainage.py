@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Liakopoulos's column: wet sand drains at its foot under gravity, contracts by suction, and settles.
+"""Liakopoulos's column: saturated sand drains at its foot under gravity; suction contracts the sand, and it settles.
 
-A column of 1 m, at rest under the weight of its water, p = 0 everywhere, is opened at its foot.  Its retention curve is
+A column of 1 m, initially in equilibrium with p = 0 everywhere, is opened at its foot.  Its retention curve is
 user-defined.  The effective stress uses chi p, with chi the saturation.  The reference is a converged solution with 400
 finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, over the largest pressure at that time.
-Further errors refer to the settlement and to the outflow at the foot.  On one process.
+Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the largest pressure at this
+time.  Errors of the settlement, and of the outflow at the foot, are relative.  On one process.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
-    parser.add_argument("--step", type=float, default=60.0, help="step up to 10 minutes, s; then three times as long")
+    parser.add_argument("--step", type=float, default=60.0, help="step up to 10 minutes, s; later three times as long")
     o = parser.parse_args(argv)
     if o.cells < 5:
         parser.error(f"--cells {o.cells}: must be >= 5")
@@ -85,7 +85,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
-    """Draw pressures over the height, and settlements over time, with the converged ones."""
+    """Draw pressures over the height and settlements over time, with the converged values."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""An embankment under water is built in lifts on soft clay, which consolidates.
+"""An embankment under water is built in lifts on soft clay, and the clay consolidates.
 
 Half of the section (x = 0 is a plane of symmetry): 6 m of clay, and four lifts of 1 m with slopes of 1:2, one every 90
-days, followed by ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh).  It is placed on the
-present ground and filled up to its design level, which makes up for the settlement.  Pressures are in excess of the sea
-above, and weights are buoyant.  The weight of the lifts is a term in UFL; the clay is in equilibrium with its own
-weight from the start.  A lift closes the drainage of the ground below, and its slope and crest are drained.  On one
-process.
+days, followed by ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh).  A lift is placed on the
+settled ground and filled up to its design level, which compensates the settlement.  Pressures are excess pressures
+relative to the sea, and weights are buoyant.  The weight of the lifts is a term in UFL; the clay is in equilibrium with
+its own weight from the start.  The ground below a lift no longer drains at its surface; slope and crest of the lift are
+drained.  On one process.
 
-Check: at the end the lowest points of the clay carry the weight of the lifts with their additional fill.  `carried` is
-the ratio of the integral of the effective stress there to this weight; it is 1 in equilibrium.
+Check: finally the lowest points of the clay carry the weight of the lifts, including the fill that compensates the
+settlement.  `carried` is the integral of the effective stress at these points, divided by this weight; it is 1 in
+equilibrium.
 """
 
 from __future__ import annotations
@@ -29,15 +30,15 @@ CLAY, CREST, SLOPE, LIFTS = (
     4.0,
     2.0,
     4,
-)  # m: depth of the clay, half the crest's width; run over rise; lifts of 1 m
+)  # m: depth of the clay, half the width of the crest; slope: run divided by rise; lifts of 1 m
 WIDTH = 24.0  # m: of the section
-PAUSE, END = 90 * DAY, 3650 * DAY  # between two lifts; after the last one
+PAUSE, END = 90 * DAY, 3650 * DAY  # time between two lifts; time after the last lift
 BUOYANT = 0.6 * (2650 - 1000) * 9.81  # N/m^3
 
 
 @dataclass(frozen=True)
 class Weighed(mpm.Hencky):
-    """Hencky's law for soil with a buoyant weight, N/m^3, a field of its points for the term `weight`."""
+    """Hencky's law for soil with a buoyant weight, N/m^3, a field that the term `weight` uses."""
 
     unit_weight: mpm.Field = 0.0
 
@@ -68,8 +69,7 @@ def lift(grid: mpm.Grid, k: int):
 class Bund:
     """Histories: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
 
-    frames: title, corners (n, 4, 2), m, and excess pressures (n,), Pa; carried: share of the lifts' weight that the
-    lowest points carry at the end.
+    frames: title, corners (n, 4, 2), m, and excess pressures (n,), Pa; carried: see the module's docstring.
     """
 
     t: list[float] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the bund on cells of size h, m, with `steps` steps between two lifts, and 6 times as many at the end."""
+    """Build the embankment on cells of size h, m; steps: number between two lifts; after the last, 6 times as many."""
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Error against run time, for material points and finite elements, in one run.
 
-Five cases have an exact or converged solution.  In each, cell size, points per cell, quadrature and coupling of the
-material points vary.  The finite elements are body-fitted: Q1/DG0 on the same grid, and Taylor-Hood.  The time is the
-shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged in space
-and in time.
+Five cases have an exact or converged solution.  In each case, the runs with material points differ in cell size, points
+per cell, quadrature and coupling.  The finite elements are body-fitted: Q1/DG0 on the same grid, and Taylor-Hood.  The
+time is the shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged
+in space and in time.
 
 * beam: the poroelastic beam; largest error of the tip deflection over all output times `beam.TIMES`, and over the times
   from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
-* drained: the same beam without water, load in ten steps; error of the tip against 67 x 20 Taylor-Hood elements
-* terzaghi: settlement at T_v = 0.5, against the exact one;  mandel: settlement of the plate at T = 0.1, exact
-* column: height of the soft column under its own weight, exact
+* drained: the same beam without water, load in ten steps; error of the tip deflection, against 67 x 20 Taylor-Hood
+  elements
+* terzaghi: error of the settlement at T_v = 0.5, against the exact settlement
+* mandel: error of the plate's settlement at T = 0.1, against the exact settlement
+* column: error of the height of the soft column under its own weight, against the exact height
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
 DEFAULT, BY_ERROR, STANDARD = "MPM, defaults", "MPM, steps by error", "standard MPM, at the points"
-STYLES = {  # of the lines: colour and marker of a method, in all cases
+STYLES = {  # colour and marker of each method, the same in all cases
     DEFAULT: ("C0", "o"),
     PEER: ("C1", "D"),
     STANDARD: ("C3", "s"),
@@ -45,7 +47,7 @@ STYLES = {  # of the lines: colour and marker of a method, in all cases
     TRUTH: ("black", "s"),
 }
 Run = Callable[[], tuple[float | tuple[float, float], mpm.Result, float]]
-"""A run: error (for the beam also that from 0.1 s on), result, compile seconds."""
+"""Error (for the beam also the error from 0.1 s on), result, and compile time, s, of a run."""
 
 
 @dataclass
@@ -122,7 +124,7 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of a box whose top moves by `exact` (m); `width` cells wide, or -1: as high.
+    """Yield (method, setting, run) of a box; exact: displacement of its top, m; width: cells, -1: as the height.
 
     time: end (s) and number of steps of the sweep over the cells; steps: numbers of steps of the sweep over time.
     """
@@ -162,7 +164,7 @@ def scene_runs(
 
 
 def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield the runs of Terzaghi's column, a load that strains it by 1e-5."""
+    """Yield the runs of Terzaghi's column under a load that strains it by 1e-5."""
     cells = (5, 20) if quick else (5, 10, 20, 50)
     load = 1e-5 * terzaghi.SOIL.oedometric
     physics = {
@@ -217,7 +219,7 @@ CASES = {
 
 
 def measure(case: str, quick: bool, repeat: int) -> list[Row]:
-    """Run one case; the error of a run that gives up is nan."""
+    """Run one case; the error of a failed run is nan."""
     rows = []
     for method, setting, run in CASES[case](quick):
         try:
@@ -238,12 +240,12 @@ def measure(case: str, quick: bool, repeat: int) -> list[Row]:
 
 
 def time_at(rows: list[Row], error: float) -> float:
-    """Return the shortest time in which runs reach an error; nan if none does."""
+    """Return the shortest time of runs with at most a given error; nan if there is no such run."""
     return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
 
 
 def compare(rows: list[Row]) -> list[dict]:
-    """Return, for each default run, the ratio of its time to that of finite elements on its grid and at its error."""
+    """Return, for each default run, its time divided by that of finite elements: on the same grid, at equal error."""
     out = []
     for r in (r for r in rows if r.method == DEFAULT):
         peers = [q for q in rows if q.case == r.case and q.method == PEER]
@@ -272,7 +274,7 @@ def table(comparison: list[dict]) -> list[list[str]]:
 
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
-    """Draw error against time: solid lines from coarse to fine cells, dashed ones from few to many steps."""
+    """Draw error against time: solid lines from coarse to fine cells, dashed lines from few to many steps."""
     fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows).most_common(1)[0][0]
     for method in dict.fromkeys(r.method for r in rows):
@@ -289,7 +291,7 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
     ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    name = "error_vs_runtime" if case == "beam" else f"error_vs_runtime_{case}"  # the beam's is on the pages
+    name = "error_vs_runtime" if case == "beam" else f"error_vs_runtime_{case}"  # the beam's picture is on the pages
     common.save(fig, out / f"{name}.png", dpi=120)
 
 

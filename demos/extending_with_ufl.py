@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Physics of your own in a few lines of UFL: columns, each with its exact solution.
+"""Your own physics in a few lines of UFL: ten columns with exact solutions.
 
 A column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature: a stored energy,
 fibres with directions on the points, two conductivities that depend on the deformation, an elastic foundation, a source
-of fluid.  Others add a law with its own state, plastic flow, an implicit stress, and a return mapping in numpy.  The
-parameters of a function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the package
-list them.
+of fluid.  Others add a law with state variables, plastic flow, an implicit stress, and a return mapping in numpy.  The
+parameter names of a function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the
+package list all possible arguments.
 
-Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for energy
-and fibres, with stretched layers in their single step; 3e-3 for both conductivities, 6e-4 for the foundation and 5e-4
-for the source.  These errors fall with the cell size.  The error of the damage is 1e-5, because its prescribed top
-gives way a little.  Plastic flow, the implicit stress and the return mapping have errors of 1e-11.
+The error is the largest difference from the exact solution, divided by the largest exact value.  With 20 cells it is
+8e-4 for the energy, 6e-4 for fibres, 3e-3 for both conductivities, 6e-4 for the foundation and 5e-4 for the source.
+These errors decrease with the cell size.  The error of the damage is 1e-5, from the penalty of the prescribed
+displacement.  Plastic flow, the implicit stress and the return mapping have errors of at most 1e-11.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> m
 
 @dataclass
 class Example:
-    """Result of a column, found (n,) and exact (n,), over the abscissa x (n,)."""
+    """Result of a column: computed (n,) and exact (n,) values at the abscissae x (n,)."""
 
     title: str
     xlabel: str
@@ -55,19 +55,19 @@ class Example:
 
     @property
     def error(self) -> float:
-        """Largest difference over the largest exact value."""
+        """Largest difference divided by the largest exact value."""
         return float(np.abs(self.found - self.exact).max() / np.abs(self.exact).max())
 
 
 def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points' heights at the start (m), upwards, and their displacements along the column (m)."""
+    """Return the initial heights of the points (m), ascending, and their displacements along the column (m)."""
     Y = s.bodies[0].centre[:, 1]
     order = np.argsort(Y)
     return Y[order], (s.points.x[:, 1] - Y)[order]
 
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of the centroids in the cells (m), upwards, and the cells' pore pressures (Pa)."""
+    """Return the heights of the cells' centroids (m), in ascending order, and the pore pressures of the cells (Pa)."""
     cells = s.cells()
     order = np.argsort(cells.x[:, 1])
     return cells.x[order, 1], cells.pressure[order]
@@ -79,13 +79,13 @@ def stretch(stress: Callable[[float], float]) -> float:
 
 
 def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
-    """Return an example's labels and values: displacement of the points, exact for four layers of known stretches."""
+    """Return labels and values of an example: displacements of the points, exact for four layers of known stretches."""
     Y, u = displacements(s)
     exact = np.interp(Y, np.linspace(0, 1, 5), np.concatenate([[0], np.cumsum(stretches - 1) / 4]))
     return "height at the start (m)", "displacement (m)", Y, u, exact
 
 
-# ---- a stored energy of one's own, stiffer from layer to layer -----------------------------------
+# ---- your own stored energy, stiffer from layer to layer -----------------------------------
 
 
 class SaintVenantKirchhoff(mpm.Skeleton):
@@ -98,7 +98,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2): it doubles from each quarter to the next one below."""
+    """Return a modulus, Pa, at reference positions (n, 2); in each quarter of the height it is twice that above."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 
@@ -111,7 +111,7 @@ def energy(cells: int) -> Example:
     return Example("energy, layered", *settlement(s, layers))
 
 
-# ---- fibres: a direction on the points ------------------------------------------------------------
+# ---- fibres: a direction at each point - ------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def of_strain(conductivity, J):
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Let water flow upwards through a column of two layers; the load compresses the lower layer more."""
+    """Let water flow upwards through a column of two layers; the load mainly compresses the lower layer."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)
@@ -219,12 +219,12 @@ def well(cells: int) -> Example:
     return Example("source of fluid", "height (m)", "pore pressure (Pa)", y, p, exact)
 
 
-# ---- a law with state: damage, set anew after every step -------------------------------------------
+# ---- a law with a state variable: damage, updated after each step -------------------------------------------
 
 
 @dataclass(frozen=True)
 class Damaged(mpm.NeoHookean):
-    """Neo-Hookean with damage D: (1 - D) psi, D = 1 - exp(-|ln J| / 0.5) at the largest |ln J| so far."""
+    """Neo-Hookean with damage D: energy (1 - D) psi, D = 1 - exp(-m / 0.5), with m the largest |ln J| so far."""
 
     state: ClassVar = {"damage": 0.0}
 
@@ -267,10 +267,10 @@ def damage(cells: int) -> Example:
 
 
 def plasticity(cells: int) -> Example:
-    """Load sand in an oedometer; see `mpm_dolfinx/plasticity.py` for how the law is written."""
+    """Load sand in an oedometer; `mpm_dolfinx/materials/drucker_prager.py` defines the law."""
     sand = mpm.DruckerPrager(bulk=1e7, shear=1e7, friction=20.0, dilation=5.0, cohesion=5e4)
     strain, stress = path(column(cells, sand, load=1e6), 20)
-    shear = 2 * sand.shear / np.sqrt(3)  # sqrt(J_2) and -p grow by this and by K with the compression
+    shear = 2 * sand.shear / np.sqrt(3)  # growth of sqrt(J_2) with the compression; -p grows by K
     toward = shear - sand.eta * sand.bulk  # the yield surface, which is met at xi c / toward
     beyond = np.maximum(0, strain - sand.xi * sand.cohesion / toward)
     gamma = toward * beyond / (sand.shear + sand.bulk * sand.eta * sand.eta_flow)
@@ -283,7 +283,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """Pressure K y, y + power y^3 = ln J: Newton's method solves it at all points, with the tangent of the solution."""
+    """Pressure K y with y + power y^3 = ln J; Newton's method solves this equation at all points."""
 
     power: mpm.Field = 100.0
 
@@ -305,7 +305,7 @@ class Hardening(mpm.Skeleton):
 
 @dataclass(frozen=True)
 class Crushable(mpm.Skeleton):
-    """Foam whose pressure cannot fall below a limit, where its volume is crushed for good; its return is in numpy."""
+    """Foam that is crushed irreversibly when its pressure reaches a limit; the return mapping is in numpy."""
 
     limit: mpm.Field = 1e5  # Pa
 

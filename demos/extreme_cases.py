@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Stiff and extreme scenes: each converges, recovers or is refused, and none is silently wrong.
 
-Every scene is tiny and has one extreme property.  It ends in one of
+Every scene is small and has one extreme property.  The outcome is one of
 
-* converged: within its family's bound of an exact solution, of finite elements, or of the same scene at a moderate
-  setting.  Both residuals and the fluid balance are below 1e-8;
-* recovered: the same, after cut steps;
-* refused: with an error that gives the reason; a scene without equilibrium must be refused;
+* converged: the error is below the bound of its family, compared with an exact solution, with finite elements, or with
+  the same scene at moderate values.  Both residuals and the error of the fluid balance are below 1e-8;
+* recovered: as converged, after cut steps;
+* refused: an error gives the reason; a scene without equilibrium must be refused;
 * warned: error above the bound, with a warning of the package;
-* wrong, nan or hung: a defect, which the exit status reports.
+* wrong, nan or hung: a defect, reported by the exit status.
 
-An error is relative to the largest exact value, unless its family defines another one.  The condition number is that of
-the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On one
+An error is relative to the largest exact value, unless the family defines another error.  The condition number is that
+of the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On one
 process.
 """
 
@@ -33,7 +33,7 @@ from scipy.sparse import csr_matrix
 
 import mpm_dolfinx as mpm
 
-LIMIT = 100  # s of processor time, for a case: other work on the machine is no fault of it
+LIMIT = 100  # s of processor time for a case, so that other work on the machine does not count
 CLOSED = 1e-8  # residuals and fluid balance
 SHOWN = {
     "fluid-bulk": "water's bulk modulus",
@@ -48,7 +48,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """Outcome of a case; worst residual and balance of its steps, total iterations."""
+    """Outcome of a case: largest residual and error of the balance of its steps, total iterations."""
 
     family: str
     setting: str
@@ -74,7 +74,7 @@ def hang(*_) -> None:
 
 
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
-    """Run a case and fill in its row; with `rtol`, adaptive steps are at most as long as the scene's."""
+    """Run a case and fill in its row; with `rtol`, adaptive steps are at most as long as the steps of the scene."""
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()
@@ -88,7 +88,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
         row.outcome = "recovered" if result.cuts else "converged"
     except (mpm.GaveUp, ValueError) as refusal:
         row.outcome, row.note, result = "refused", str(refusal), getattr(refusal, "result", result)
-    except Exception as error:  # not one that says clearly what the matter is
+    except Exception as error:  # not an error that explains the problem
         hung = isinstance(error, Hung) or time.process_time() - began >= LIMIT  # some stop within PETSc
         row.outcome, row.note = ("hung", f"more than {LIMIT} s") if hung else ("wrong", repr(error))
     finally:
@@ -137,7 +137,7 @@ def worst(rows: list[Row], name: str) -> float:
 
 
 def table(head: list[str], rows: list[list]) -> str:
-    """Return a Markdown table, with numbers in short form and blanks for missing ones."""
+    """Return a Markdown table, with short numbers, and blanks for missing numbers."""
 
     def cell(v) -> str:
         if isinstance(v, float):
@@ -148,7 +148,7 @@ def table(head: list[str], rows: list[list]) -> str:
 
 
 def summary(rows: list[Row]) -> str:
-    """Return a line for each family: subject, bound, counts of the outcomes and worst figures."""
+    """Return a row for each family: subject, bound, number of each outcome, and largest errors."""
     names = ("error", "residual", "balance", "condition")
     lines = []
     for name, f in FAMILIES.items():
@@ -170,7 +170,7 @@ def write(out: Path, rows: list[Row]) -> None:
 
 
 def draw(out: Path, rows: list[Row]) -> None:
-    """Draw the errors, condition numbers and Newton iterations a step of all cases, a row a family."""
+    """Draw errors, condition numbers and Newton iterations per step of all cases, in one row for each family."""
     names = [name for name in FAMILIES if any(r.family == name for r in rows)]
     colours = dict(zip(OUTCOMES, ("C0", "C2", "0.5", "C1", "C3", "black", "C4"), strict=True))
     fig, (axes,) = common.figure(1, 3, (13, 1.5 + 0.34 * len(names)))

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A box slides, a ball rolls and another ball bounces down an incline: distances against rigid-body motion, energies.
+"""A box slides, a ball rolls and a second ball bounces down an incline: distances against rigid-body motion, energies.
 
-The incline, 30 degrees to the grid, is rough, mu = 0.3.  A rigid box slides by (sin b - mu cos b) g t^2 / 2.  A rigid
-disc, mu > tan b / 3, rolls by sin b g t^2 / 3.  Another disc falls on the incline from a height of its own radius.  It
-flies until the impact, then bounces and rotates.  Box and discs are stiff rubber.  Each is a single body that touches
-the incline only.  The final energy is the work of gravity, minus the dissipation by friction and the loss to waves.
-Needs gmsh.
+The incline has an angle b = 30 degrees to the grid and friction mu = 0.3.  A rigid box slides by a distance
+(sin b - mu cos b) g t^2 / 2.  A rigid disc, with mu > tan b / 3, rolls by sin b g t^2 / 3.  A second disc falls on the
+incline from a height of one radius, bounces and rotates.  Box and discs consist of stiff rubber, and touch only the
+incline.  The final energy is the work of gravity, minus the dissipation by friction and the loss by waves.  Needs gmsh.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ RADIUS, BOX, DROP = 0.15, (0.3, 0.2), 0.15  # m
 RUBBER = {"bulk": 1e6, "shear": 6e5, "grain_density": 2000.0}
 ALONG = np.array([np.cos(ANGLE), -np.sin(ANGLE)])
 NORMAL = np.array([np.sin(ANGLE), np.cos(ANGLE)])
-FOOT = np.array([0.2, 1.25])  # m, where the box begins
+FOOT = np.array([0.2, 1.25])  # m: initial position of the box
 NAMES = ("box that slides", "ball that rolls", "ball that bounces")
 LASTS = 0.5  # s
 BOUNDS = {"slides": 0.005, "rolls": 0.01, "flies": 0.001, "energy": 0.03}
@@ -50,7 +49,7 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 
 
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
-    """Release the bodies; return the run, times and centres (times, 1 + 3 x 2), s and m, and some shapes in motion."""
+    """Release the bodies; return the run, times, s, with centres, m (times, 1 + 3 x 2), and some shapes."""
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []
 
@@ -102,7 +101,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the shapes in motion, their distances and the distances of rigid bodies, and energies."""
+    """Draw the moving shapes, the distances of these and of rigid bodies, and energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)

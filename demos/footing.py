@@ -1,40 +1,44 @@
 # SPDX-License-Identifier: MIT
-"""A strip footing is pushed into saturated soil by its width: fast, at an intermediate rate and slowly.
+"""A strip footing is pushed into saturated soil to a depth of its width: fast, at an intermediate rate, and slowly.
 
-Half of the footing, rough and rigid, is a prescribed displacement on a part of the soil's top.  The soil is a layer
-2.5 B thick on rough rock.  It follows Drucker and Prager's law with cohesion c, is weightless, and drains at its free
-top.  v is the rate of the push, V = v B / c_v its ratio to that of consolidation, B the footing's width.
+Half of the rough, rigid footing of width B is computed, as a prescribed displacement on a part of the soil surface.
+The soil is a weightless layer, 2.5 B thick, on rough rock.  It follows the Drucker-Prager law with cohesion c, and
+drains at its free surface.  v is the velocity of the footing, and V = v B / c_v the ratio of penetration rate to
+consolidation rate.
 
-The box ends 8 B from the middle at a smooth, impervious wall.  With a wall at 16 B, loads change by less than 1 % at
-any depth and rate; the demo shows this on fewer cells.  With a wall at 4 B drained loads are up to 8 % too large while
-the soil below yields, before the limit is reached.  The thickness of the layer matters.  In plane strain the settlement
-of a thicker layer grows without bound, as its logarithm (5 B: loads down by 11 % at 0.1 B, 3 % at 0.5 B).
+A smooth, impervious wall stands 8 B from the middle.  With a wall at 16 B, loads change by less than 1 % at any depth
+and rate; the demo shows this on larger cells.  With a wall at 4 B, drained loads are up to 8 % too large before the
+limit load is reached.  The thickness of the layer also has an influence.  In plane strain the settlement grows with the
+logarithm of this thickness.  With a layer of 5 B, loads are 11 % lower at a settlement of 0.1 B, and 3 % lower at 0.5
+B.
 
 Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c,
-N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  The limit loads use very stiff soil, which flows before
-the geometry changes, with --cells over the width and about twice as many.
+N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Limit loads are computed for very stiff soil, which
+yields before the geometry changes.  Runs use --cells cells over the width, and about twice as many.
 
-For the deep push the soil does not dilate.  Its undrained strength is s_u = xi c.  A base at depth D carries
-(1 + 0.27 sqrt(D/B)) times as much (fit to bounds of limit analysis, Salgado et al. 2004).  Its drained capacity at the
-surface lies between that of Davis's (1968) reduced friction and c N_c.
+For deep penetration the soil does not dilate.  The undrained strength is s_u = xi c.  At depth D the limit load is (1 +
+0.27 sqrt(D/B)) times that at the surface (fit to bounds of limit analysis, Salgado et al. 2004).  The drained limit
+load at the surface lies between the load with Davis's (1968) reduced friction and B c N_c.
 
-The undrained limit converges from below, with order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The last fixed node
-carries half a cell beyond it, so an odd number of cells represents the true width.  With 4, 8, 16 cells the last node
-lies at the edge, and the load is larger by that half cell on both sides.
+The undrained limit load converges from below, with order 1.5: errors of -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The
+last prescribed node also carries half a cell beyond the node, so an odd number of cells represents the true width.
+With 4, 8, 16 cells the last node lies at the edge of the footing, whose width is then too large by half a cell on each
+side.
 
 In associated flow each point of a cell must dilate with its own shear, but the cell has one mean dilatation.  The
-load would rise without limit (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  In fully yielding
-cells, laws therefore use half of the deviation of the gradient from its mean: -1.0, +0.2, +0.8 % with 5, 9, 17 cells.
+load would rise without limit (de Borst and Groen 1995), to errors of +4.4 and +3.4 % with 9 and 17 cells.  In fully
+yielding cells, laws therefore use half of the deviation of the gradient from the cell mean.  The errors are then -1.0,
++0.2, +0.8 % with 5, 9, 17 cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
-With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside it, each cell is a tenth longer than the one
-before, up to eight times the length of the smallest.  A box of 20 B x 10 B then has hardly more cells than one of 4 B x
-2.5 B with fine cells only.
+With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside this box, each cell is a tenth longer than
+its neighbour, up to eight times the length of the smallest cell.  A grid of 20 B x 10 B then has hardly more cells than
+a grid of 4 B x 2.5 B with fine cells only.
 
-With non-associated flow the solution is not unique.  Shear bands one cell wide jump from place to place, more so with
-finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a resistance to the shear
-rate, small compared with the cohesion, which makes the solution unique (Needleman 1988).
+With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their place between
+steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a
+viscous shear resistance, small compared with the cohesion, which makes the solution unique (Needleman 1988).
 """
 
 from __future__ import annotations
@@ -64,18 +68,18 @@ WATER = mpm.Fluid()
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-3}  # V
 COLOURS = ("C0", "C1", "C2")  # of the rates
-STEP = 1 / 14  # of a cell: how far the footing goes in a step
-BOX = (8.0, 2.5)  # width and height of half the soil over B
-COARSE = 5  # cells over the footing's width, at most, where a box twice as wide is beside it
-STIFF = 100  # times stiffer is the soil that meets the theory
-LIMITS_OF = {  # how: depth of the push over B, box
+STEP = 1 / 14  # fraction of a cell that the footing moves in a step
+BOX = (8.0, 2.5)  # width and height of half the soil, divided by B
+COARSE = 5  # largest number of cells over the width, in runs with a box twice as wide
+STIFF = 100  # factor of the stiffness of soil for limit loads
+LIMITS_OF = {  # for limit loads: depth divided by B, box
     "undrained": (0.0012, (2.0, 1.2)),
     "drained": (0.003, (4.0, 1.7)),
     "circular": (0.0012, (2.0, 1.2)),
 }
-NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box over B; of cells that are graded; over the fine ones
-FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil over B
-ROUND = 6.05  # limit load of a rough circular footing over its area and s_u
+NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box, over B; ratios of neighbouring and extreme cells
+FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil, divided by B
+ROUND = 6.05  # limit load of a rough circular footing, divided by area and s_u
 
 
 def capacity(friction: float) -> float:
@@ -84,7 +88,7 @@ def capacity(friction: float) -> float:
     return 2 + np.pi if t == 0 else (np.exp(np.pi * t) * np.tan(np.pi / 4 + np.radians(friction) / 2) ** 2 - 1) / t
 
 
-SURFACE = {  # loads over B c; Davis: tan phi* = sin phi of the same strength in plane strain
+SURFACE = {  # loads divided by B c; Davis: tan phi* = sin phi of the same strength in plane strain
     "undrained": SOIL.xi * capacity(0.0),
     "drained, Davis": SOIL.xi * capacity(np.degrees(np.arctan(SOIL.eta))),
     "drained, associated": capacity(FRICTION),
@@ -92,16 +96,16 @@ SURFACE = {  # loads over B c; Davis: tan phi* = sin phi of the same strength in
 
 
 def embedded(depth):
-    """Return the undrained limit load over B c of a base at a depth, over B."""
+    """Return the undrained limit load divided by B c; depth: depth of the base divided by B."""
     return SURFACE["undrained"] * (1 + 0.27 * np.sqrt(depth))
 
 
 @dataclass
 class Frame:
-    """A moment of a push.
+    """State of a run at one output time.
 
-    t: time over the duration of the push; settlement over B; corners of the domains, m; pressure of the points, Pa; top
-    (m, 2): the soil's surface from the middle outward, m.
+    t: time divided by the duration of the penetration; settlement divided by B; corners of the domains, m; pressure of
+    the points, Pa; top (m, 2): surface of the soil from the middle outward, m.
     """
 
     t: float
@@ -113,7 +117,7 @@ class Frame:
 
 @dataclass
 class Push:
-    """A push: settlement over B and load over B c in each step; some frames; the last step of the push; its runs.
+    """A run: settlement divided by B, load divided by B c; some frames; last step of penetration; results.
 
     Heights are measured from the initial surface of the soil.
     """
@@ -130,7 +134,7 @@ class Push:
 
     @property
     def at_end(self) -> Frame:
-        """The frame at the end of the push."""
+        """The frame at the end of penetration."""
         return next(frame for frame in self.frames if frame.t >= 1 - 1e-9)
 
 
@@ -152,23 +156,23 @@ def push(
     Parameters
     ----------
     soil, cells
-        The soil, and cells over the footing's width, odd.
+        The soil, and the number of cells over the footing's width, odd.
     depth
-        Depth of the push over B.
+        Final depth, divided by B.
     rate
-        V; None: without water.
+        V; None: soil without water.
     box
-        Width and height of half the soil over B.
+        Width and height of the computed half of the soil, divided by B.
     rest
-        Time of consolidation after the push, over B²/c_v.
+        Time of consolidation after the penetration, divided by B²/c_v.
     steps
-        Equal steps of the push; by default from `STEP`.
+        Number of equal steps; by default computed from `STEP`.
     circular
-        A disc of the diameter B, not a strip.
+        Whether the footing is a disc of diameter B instead of a strip.
     method
-        Of time integration.
+        Method of time integration.
     graded
-        Whether cells grow away from the footing.
+        Whether the size of cells increases away from the footing.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
@@ -209,7 +213,7 @@ def push(
 
 
 def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
-    """Push the footing into very stiff soil; its loads are relative to theory.
+    """Push the footing into very stiff soil; the loads are divided by the theoretical limit load.
 
     box, graded: see `push`; by default the box of `LIMITS_OF` with equal cells.
     """
@@ -232,11 +236,11 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
-    parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
-    parser.add_argument("--steps", type=int, help="only push at the intermediate rate, in so many equal steps")
-    parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil over B")
+    parser.add_argument("--depth", type=float, default=1.0, help="final depth divided by the footing's width")
+    parser.add_argument("--steps", type=int, help="run only the intermediate rate, in this number of equal steps")
+    parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil divided by B")
     methods = ("sdirk2", "backward-euler")
-    parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: of time integration")
+    parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: time integration")
     what = "with --steps: viscosity of the soil over the cohesion and the time of the push"
     parser.add_argument("--viscosity", type=float, default=0.0, help=what)
     parser.add_argument(
@@ -298,7 +302,7 @@ def of_many_sizes(cells: int, folder: Path) -> dict:
 
 
 def draw_cells(ax, frame: Frame) -> None:
-    """Draw the domains of points with their pressures, over the largest one."""
+    """Draw the particle domains with pressures divided by the largest pressure."""
     from matplotlib.collections import PolyCollection
 
     corners, p = frame.corners[:, [0, 1, 3, 2]], frame.pressure / COHESION
@@ -312,9 +316,9 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity, relative to c times the duration of a push, s.
+    """Return the soil with a viscosity, given relative to c times the duration of the penetration, s.
 
-    It equals the additional resistance over c at a shear strain of 1 in this duration.
+    This relative viscosity is the additional shear strength, divided by c, at a shear strain of 1 in this duration.
     """
     if viscosity == 0:
         return SOIL
@@ -323,9 +327,9 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
 
 
 def effort(cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0) -> dict:
-    """Push at the intermediate rate in equal steps; print their cost and return it.
+    """Push at the intermediate rate in equal steps; print and return the cost.
 
-    width: of half the soil, over B; viscosity: see `viscous`.
+    width: width of half the soil, divided by B; viscosity: see `viscous`.
     """
     began, rate = time.process_time(), RATES["intermediate"]
     soil = viscous(viscosity, depth * WIDTH**2 / (CV * rate))
@@ -354,7 +358,7 @@ def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
 
 
 def twice_the_box(cells: int, depth: float) -> dict[str, float]:
-    """Print and return the largest change of load in a box twice as wide, over the load in `BOX` at that depth."""
+    """Print and return the largest change of load in a box twice as wide, relative to `BOX` at the same depth."""
     out = {}
     for name, rate in RATES.items():
         near, far = (push(SOIL, cells, depth, rate, box=(wide * BOX[0], BOX[1])) for wide in (1, 2))
@@ -367,7 +371,7 @@ def twice_the_box(cells: int, depth: float) -> dict[str, float]:
 
 
 def report(runs: dict[str, Push]) -> dict:
-    """Print the results of the pushes and return them."""
+    """Print and return the results of all runs."""
     out = {}
     for name, run in runs.items():
         out[name] = found = {
@@ -393,9 +397,9 @@ def report(runs: dict[str, Push]) -> dict:
 
 
 def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
-    """Draw the pressure, in c, of two frames as left and right half of the soil, and the footing.
+    """Draw pressures divided by c of two frames, as left and right half of the soil, and the footing.
 
-    Domains at the footing's edge that became inverted and were replaced leave white gaps.
+    Inverted domains at the edge of the footing have new corners; they leave white gaps.
     """
     from matplotlib.collections import PolyCollection
 
@@ -420,12 +424,12 @@ def block(ax, frame: Frame) -> None:
 
 
 def scale(run: Push) -> tuple[float, float]:
-    """Return the limits of the colour scale, in c, for the pressures of a push."""
+    """Return the colour limits for the pore pressure divided by the cohesion c in one run."""
     return 0.0, max(float(np.quantile(frame.pressure, 0.99)) for frame in run.frames) / COHESION
 
 
 def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -> None:
-    """Draw pressures, load over settlement, the soil's surface, and the limit loads of stiff soil."""
+    """Draw pressures, load against settlement, the surface of the soil, and limit loads of stiff soil."""
     fig, ((soil, curve), (surface, limit)) = common.figure(2, 2, (12, 7.5))
     run = runs["intermediate"]
     quads = view(soil, (run.at_end, run.frames[-1]), scale(run))
@@ -459,7 +463,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
 
 
 def draw_loads(ax, runs: dict[str, Push]) -> None:
-    """Draw load over settlement at all rates, and the theory."""
+    """Draw load against settlement at all rates, and theoretical loads."""
     for (name, each), colour in zip(runs.items(), COLOURS, strict=True):
         upto = each.pushed + 1
         ax.plot(each.settlement[:upto], each.load[:upto], color=colour, label=f"{name}, V = {RATES[name]:g}")
@@ -479,7 +483,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
 
 
 def animate(out: Path, run: Push) -> None:
-    """Draw the push and the consolidation as an animation."""
+    """Draw penetration and consolidation as an animation."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     fig, ((ax,),) = common.figure(1, 1, (6.4, 3.9))

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A rigid cylinder is pressed into a wet gel and held, and its force relaxes as the gel drains.
+"""A rigid cylinder is pressed into a saturated gel and stays there; the force relaxes as the gel drains.
 
-In plane strain, half of the gel is computed.  It is 5 m wide and high, lies on a smooth base, and drains at its side,
-far from the cylinder.  The cylinder moves down at once.
+In plane strain, half of the gel is computed.  The computed half is 5 m wide and 5 m high, lies on a smooth base,
+and drains at its side, far from the cylinder.  The cylinder moves down suddenly.
 
-* Immediately no water flows and the gel is incompressible.  The pressure under the cylinder is Hertz's,
+* Initially no water has flowed, and the gel is incompressible.  The pressure under the cylinder is Hertz's,
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
-  E* = 4 G of the undrained gel.  In a layer this holds for the actual force F.
-* Finally the pore pressure has dissipated.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
-  force equals that of a dry scene, which the demo also runs.
+  with E* = 4 G of the undrained gel.  In a layer these formulas hold for the actual force F.
+* Finally the pore pressure has dissipated.  Hertz's formulas hold with E* = E / (1 - nu^2) of the drained gel.  The
+  force equals that on a dry gel, which the demo also computes.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ DEPTH = 0.03  # m
 UNDRAINED, DRAINED = 4 * GEL.shear, E / (1 - NU**2)  # Pa: E*
 TIME = SIZE**2 * mpm.Fluid().unit_weight / (GEL.conductivity * GEL.oedometric)  # s: of consolidation
 INSTANT = 1e-8  # of it
-TIMES = np.geomspace(1e-4, 10, 21)  # over it: at which the force is recorded
+TIMES = np.geomspace(1e-4, 10, 21)  # times divided by this time, at which the force is recorded
 
 
 @dataclass
 class Contact:
-    """The contact at a time: force (N/m), places (m,), m, and pressures (m,), Pa, of the gel's points at the surface.
+    """The contact at a time: force, N/m, and positions (m,), m, and pressures (m,), Pa, of points at the gel's surface.
 
     most, half: largest pressure, Pa, and half-width, m, of the ellipse that fits them.
     """
@@ -67,7 +67,7 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
     """Return half of the gel under the cylinder, with a number of cells per metre."""
     n, h = round(SIZE * cells), 1 / cells
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
-    top = SIZE + 0.3 * h  # the surface is no line of the grid
+    top = SIZE + 0.3 * h  # the surface is not on a grid line
     at_once = INSTANT * TIME
     shape = mpm.Ball((0, top + RADIUS), RADIUS)
     ball = mpm.Tool(shape, displacement=lambda t: (0, -DEPTH * min(1, t / at_once)), name="ball")
@@ -87,8 +87,8 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 class Pressed:
     """A run.
 
-    contacts: at once and, if wet, in the end; forces: N/m, at once and at `TIMES`; frame: corners, pore pressures and
-    cylinder at once; balance: worst error of the fluid balance; cuts: cut steps.
+    contacts: initial and, in a saturated gel, final contact; forces: N/m, initially and at `TIMES`; frame: initial
+    corners, pore pressures and cylinder; balance: largest error of the fluid balance; cuts: number of cut steps.
     """
 
     contacts: list[Contact]
@@ -99,7 +99,7 @@ class Pressed:
 
 
 def pressed(cells: int, wet: bool) -> Pressed:
-    """Press the cylinder into the gel and, if it is wet, let it drain."""
+    """Press the cylinder into the gel; let a saturated gel drain."""
     s = scene(cells, wet)
     tool = s.conditions[0]
     result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
@@ -117,7 +117,7 @@ def pressed(cells: int, wet: bool) -> Pressed:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact")
+    parser.add_argument("--cells", type=int, default=12, help="cells per metre; the contact is about 1.5 m wide")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 64:
         parser.error(f"--cells {o.cells}: must be 4 to 64")

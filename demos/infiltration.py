@@ -6,9 +6,9 @@ and nine tenths of it after that.  Heads are compared with the series of Srivast
 front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  It is compared with a
 converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells with the same steps.
 
-Errors: for the rain, the largest error of a head at 1, 6 and 12 h over the largest head at that time.  For the front,
-the position of the head -5 m and the infiltrated water, at 6 and 12 h, of material points and of elements.  On one
-process.
+Errors for the rain: largest error of the head at 1, 6 and 12 h, divided by the largest head at this time.  Errors for
+the front, at 6 and 12 h, of material points and of finite elements: position of the head -5 m, and infiltrated volume.
+On one process.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> 
 
 
 def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
-    """Return the cells' heights and heads at each of `HOURS`, the errors, and whether the run converged."""
+    """Return heights and heads of the cells at each of `HOURS`, the errors, and whether the run converged."""
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=K, retention=mpm.Gardner(WEIGHT / ALPHA))
     sides = [mpm.Drained("bottom"), mpm.Rain("top", 0.9 * K)]
     s = column(cells, soil, lambda x: WEIGHT / ALPHA * np.log(0.1 + 0.9 * np.exp(-ALPHA * x[:, 1])), sides)
@@ -83,7 +83,7 @@ def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
 
 
 def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
-    """Return depths and heads of the cells at 6 and 12 h, errors of front, m, and water, and whether it converged."""
+    """Return depths and heads of cells at 6 and 12 h, errors of front, m, and water, and whether the run converged."""
     s = column(cells, **DRY)
     start = s.cells().water.sum()
     found, places, waters = [], [], []
@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heads: list, depths: list) -> None:
-    """Draw heads over heights with the series, and over depths with the converged positions of the front."""
+    """Draw heads over the height with the series, and over the depth with the converged positions of the front."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):

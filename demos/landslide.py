@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  It
-settles under its weight without inertia; its factor of safety is 1.4.  Then its strength is divided by 1.6, at once.
+A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  The
+slope settles under its weight without inertia; the factor of safety is 1.4.  Then the strength is suddenly divided by
+1.6.
 
-With inertia it accelerates until its new shape is stable, and moves on until friction stops it.  Without inertia, as
-in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then stops at
-the first stable shape, so its run-out is shorter.  Energies balance: friction dissipates the work of gravity, except
-for the elastic part.
+With inertia the soil accelerates until its shape is stable, and moves further until friction stops the motion.  Without
+inertia, as in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then
+stops at the first stable shape, so its run-out is shorter.  Friction dissipates the work of gravity, except for the
+change of elastic energy.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ import slope as still
 import mpm_dolfinx as mpm
 
 GRAVITY = 9.81  # m/s²
-LASTS, REST = 7.0, 0.05  # s; m/s: slower than this it is at rest
-BALANCE = 0.01  # share of the work of the weight by which energies may be off
+LASTS, REST = 7.0, 0.05  # s; m/s: below this speed the slope counts as at rest
+BALANCE = 0.01  # allowed error of the energy balance, relative to the work of the weight
 
 
 def slope(cells: int) -> mpm.Simulation:

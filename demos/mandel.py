@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Mandel's slab: compressed between rigid plates, with a rise of pressure in its middle before it drains.
+"""Mandel's slab: compressed between rigid plates, with a rise of pressure in the middle before drainage.
 
-A saturated slab between rigid, smooth, impervious plates takes a force in the first step.  Its free sides drain and
-soften first, so the plates load the middle more.  The pressure there rises above its first value p0 = force / (2a):
-the Mandel-Cryer effect, which only a two-way coupling has.  By symmetry a quarter is computed, a = 1 m wide and 1 m
-high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain theory is
-accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  The solution is linear over the height, which
-needs few cells.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
+In the first step a force acts on a saturated slab between rigid, smooth, impervious plates.  The free sides drain and
+soften first, so the load on the middle increases.  The pressure in the middle rises above its initial value p0 = force
+/ (2a).  This Mandel-Cryer effect occurs only with two-way coupling.  By symmetry a quarter is computed, a = 1 m wide
+and 1 m high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain
+theory is accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  The solution is linear over the height, so
+few cells suffice in this direction.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one
+process.
 
 Errors:
 
-* `p_0.01` to `p_1`: the largest over the cells of |p - exact| a / force at T = 0.01, 0.1, 0.5 and 1, at the centroid of
-  the cell;
-* `p_max`: the relative error of the highest pressure in the innermost cell, at T = 0.07;
-* `p_rise`, which is stricter: the relative error of the rise of this pressure above p0;
-* `settlement`: the largest relative error of the plate's settlement at these times.
+* `p_0.01` to `p_1`: the largest error |p - exact| a / force of all cells, at centroids, at T = 0.01, 0.1, 0.5 and 1;
+* `p_max`: the relative error of the largest pressure in the innermost cell, which occurs at T = 0.07;
+* `p_rise`: the relative error of the rise of this pressure above p0, a stricter measure;
+* `settlement`: the largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.
 
-Most of the error is spatial: it falls with the square of the cell size.
+Most of the error is spatial, and decreases with the square of the cell size.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 
 @dataclass
 class Outcome:
-    """Results of a run, an entry for each step: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m).
+    """Results of each step of a run: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m).
 
-    Settlements of the top are given at eleven places from the middle to the side.
+    Settlements of the top are given at eleven positions from the middle to the side.
     """
 
     time: list[float] = field(default_factory=list)
@@ -53,7 +53,7 @@ class Outcome:
     stages: list[mpm.Result] = field(default_factory=list)
 
     def at(self, time: float) -> int:
-        """Return the step that ends nearest to a T."""
+        """Return the index of the step that ends nearest to T."""
         return int(np.argmin(np.abs(np.array(self.time) - time)))
 
 
@@ -91,7 +91,7 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
 
 
 def exact_peak(x: float) -> float:
-    """Return the highest pressure at a position at any time, Pa."""
+    """Return the largest pressure at a position at any time, Pa."""
     return float(EXACT.pressure(x, np.geomspace(1e-3, 1, 5001) * WIDTH**2 / EXACT.cv).max())
 
 
@@ -111,7 +111,7 @@ def errors(out: Outcome) -> dict[str, float]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=40, help="cells over the width, four times those over the height")
+    parser.add_argument("--cells", type=int, default=40, help="cells over the width; over the height: a quarter")
     parser.add_argument("--steps", type=int, default=30, help="equal steps to each of T = 0.01, 0.1, 0.5, 1")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 1:
@@ -127,7 +127,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the width, and in the middle over time, with the exact curves."""
+    """Draw the pressure over the width, and the pressure in the middle over time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     unit, scale, x = WIDTH**2 / EXACT.cv, FORCE / WIDTH, np.linspace(0, WIDTH, 201)
     for i, k in enumerate(map(out.at, SAMPLES)):

@@ -1,28 +1,30 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, a rigid cylinder, is pushed sideways through clay, deep below the surface.
 
-The clay is von Mises's, undrained, of strength s_u in plane strain.  The bar starts in place and is pushed until the
-clay flows all around it.  Then its resistance is that of Randolph and Houlsby (1984), for adhesion alpha s_u on it,
+The clay is undrained and follows von Mises's law, with strength s_u in plane strain.  The bar is embedded in the clay
+at the start, and is pushed until the clay flows around the bar.  For adhesion alpha s_u on the bar, the resistance is
+then that of Randolph and Houlsby (1984),
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-Half of the clay, a block eight diameters wide and high, lies between smooth walls.  A pressure on its top keeps the gap
-behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.  In a
-narrower block the resistance is lower: four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 for a
-rough bar.
+Half of a block of clay, eight diameters wide and high, lies between smooth walls.  A pressure on the top prevents a gap
+behind the bar.  The clay settles under this pressure, and therefore first loads the bar downwards.  In a narrower block
+the resistance is lower: for a rough bar in a block four diameters wide, N is 10.9 and 10.8 with 8 and 16 cells over the
+diameter.
 
-Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  The clay is therefore
-seeded again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu
-and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each
-new seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter, and
-`spread` is its variation there.
+Clay ahead of the bar flows around the bar and stretches exponentially, by about e^4 in a penetration of one diameter.
+After each quarter of a diameter, new particle domains are therefore seeded around the bar, with the present stresses
+(remeshing and interpolation: Hu and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  The stress is the only
+state variable of this clay.  After each new seeding, N is lower for one or two steps.  Errors refer to the mean of N in
+the last part of each quarter, and `spread` is the variation of N in this part.
 
-Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v.  Water of the same pressure
-stands on top, so the clay starts without effective stress.  Wet clay is seeded only once.  The domains ahead of the bar
-are narrower at first, in proportion to their later stretch, and end as wide as the others.
+In saturated clay a smooth bar is pushed by one diameter, at three rates V = v D / c_v.  The water pressure on top
+equals the applied total pressure, so the clay has no initial effective stress.  Saturated clay is seeded only once.
+Domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as the
+others.
 
-With --follow the bar is pushed once more, through small cells that move with it.  Grid lines follow the bar: their
-number stays, and the cells around the small ones widen behind the bar and narrow ahead of it.
+With --follow the bar is pushed once more, on small cells that move with the bar.  The number of grid lines does not
+change: larger cells become wider behind the bar and narrower ahead of the bar.
 """
 
 from __future__ import annotations
@@ -43,18 +45,18 @@ STRENGTH, PRESSURE = 1e3, 2e4  # Pa: s_u of the undrained clay, and the pressure
 SHEAR = 100 * STRENGTH
 ROUGH = (0.0, 0.5, 1.0)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
-LEG, STEADY = 0.25, 0.75  # diameters after which clay is seeded anew; share of such a way from which on N counts
-BEARS = 0.999  # share of the strength that stresses may take as clay is seeded anew
-STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar goes in a step
-NOSE = 0.02  # width of the wet clay's narrowest domains over that of the others
+LEG, STEADY = 0.25, 0.75  # diameters between seedings; fraction of this distance after which N is used
+BEARS = 0.999  # largest stress after a new seeding, as a fraction of the strength
+STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar moves in a step
+NOSE = 0.02  # width of the narrowest domains of saturated clay, divided by that of the others
 PARTS = 4  # each of those that widen away from the nose is a part of its distance from there
 CLAY = mpm.DruckerPrager(2 * SHEAR, SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH, conductivity=1e-9)
 WATER = mpm.Fluid()
 CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-2}  # V
-SETTLED = 1e-3  # of the push's time: that in which the pressure comes
+SETTLED = 1e-3  # fraction of the time of the run in which the pressure is applied
 BALANCE = 1e-8  # relative error of the fluid balance that is allowed
-FINE_ZONE, RATIO = 1.0, 1.3  # m around the bar with small cells that follow it; ratio of the cells beyond
+FINE_ZONE, RATIO = 1.0, 1.3  # m: region of small cells around the bar; ratio of cell sizes outside this region
 
 
 def exact(alpha: float) -> float:
@@ -65,7 +67,7 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between domains; ahead of the bar, at 0, widths fall to `nose` times the other widths."""
+    """Return the angles between domains; nose: width of domains ahead of the bar, divided by the others."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -92,7 +94,7 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
     top = ((0, size[1] - around / 4 * h / 2 - HALF - 1e-9), tuple(size))
 
-    def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the block's sides, ever larger
+    def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the sides of the block, with increasing size
         angle = np.interp((X[:, 1] + HALF) / (h / 2), np.arange(len(at)), at)
         e = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
         reach = 1 / np.maximum(e[:, 0] / HALF, np.abs(e[:, 1]) / np.where(e[:, 1] > 0, HALF - y, HALF + y))
@@ -103,11 +105,11 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
 @dataclass
 class Push:
-    """A push, by step: depths over D, resistances over s_u D, whether they are used, and excess pressures over s_u.
+    """Steps of a run: depths divided by D, resistances N, whether N is used, excess pressures divided by s_u.
 
-    frame: at the end, corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
-    displacement of the points over that of the bar, since the clay was seeded.  In wet clay it is the excess pressure
-    over s_u. lines: then, along both axes, m.
+    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
+    displacement of the points since the last seeding, divided by that of the bar.  In saturated clay the field is the
+    excess pressure divided by s_u.  lines: final grid lines along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -122,7 +124,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Load the clay, then push a bar of roughness alpha to a depth, over D; the clay is seeded again in each part.
+    """Load the clay, then push a bar of roughness alpha; depth: divided by D; new domains are seeded in each part.
 
     follow: whether grid lines follow the bar.
     """
@@ -133,7 +135,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar at y over D by a distance over D, from given stresses or the loaded clay; return final stresses."""
+    """Push a bar from y by a distance (divided by D), with given stresses or in loaded clay; return final stresses."""
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
@@ -159,7 +161,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return the effective stress (n, 3, 3), Pa, at positions x (n, 2), interpolated and within the strength."""
+    """Return the effective stress (n, 3, 3), Pa, interpolated to positions x (n, 2) and limited by the strength."""
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
     between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
@@ -177,7 +179,7 @@ def kept(simulation: mpm.Simulation) -> Callable:
 
 
 def push_wet(rate: float, cells: int, depth: float) -> Push:
-    """Push a smooth bar to a depth, over D, into wet clay, at a rate V."""
+    """Push a smooth bar into saturated clay at a rate V; depth: divided by D."""
     grid, body, top = clay(cells, NOSE)
     speed = rate * CV / D  # m/s
     start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
@@ -212,9 +214,9 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
     parser.add_argument("--depth", type=float, default=1.0, help="of the pushes, over the diameter")
-    parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in wet clay")
+    parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in saturated clay")
     parser.add_argument("--wet-depth", type=float, default=1.0, help="of the pushes into wet clay, over the diameter")
-    parser.add_argument("--follow", action="store_true", help="push the last bar once more, with lines that follow it")
+    parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
         parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 4], in [0, 1]")
@@ -246,7 +248,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar through lines that follow it; return resistance and number of cells, relative to equal cells."""
+    """Push a bar on grid lines that follow the bar; return resistance and number of cells, relative to equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))
@@ -295,7 +297,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
 
 
 def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the end of a push with the field of its frame."""
+    """Draw the last frame of a run, with its field."""
     corners, values, bar = run.frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")

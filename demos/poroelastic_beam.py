@@ -2,11 +2,11 @@
 """A poroelastic beam of 1 m x 0.3 m: a saturated cantilever under a constant load.
 
 A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load rises linearly
-over the ramp and then remains constant.  The ends of the beam are permeable, and its long sides are no-flow.  It is in
-plane strain, or 0.1 m deep between smooth walls (--dim 3), which is equivalent.  At first the pore water carries a part
-of the load.  The beam drains and sags by a third of its length.  Two other solutions are shown.  One is
-Euler-Bernoulli's small-strain beam without water.  The other (--reference) is a body-fitted Taylor-Hood finite element
-solution of the same finite-strain Biot problem, in steps of a quarter of --dt.
+over the ramp and then remains constant.  The ends of the beam are permeable, and its long sides are no-flow.  The beam
+is in plane strain, or equivalently in 3D, 0.1 m deep between smooth walls (--dim 3).  At first the pore water carries a
+part of the load.  As the beam drains, the tip deflection reaches a third of the length.  Two other solutions are shown.
+The first is the small-strain Euler-Bernoulli beam without water.  The second (--reference) solves the same
+finite-strain Biot problem with Taylor-Hood elements on a body-fitted mesh, in steps of a quarter of --dt.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ REFERENCE_CELLS = (67, 20)
 TIMES = (0.02, 0.04, 0.06, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2)  # s
 TRUTH = (-0.0665718, -0.1444268, -0.2306306, -0.2652579, -0.3085867)
 TRUTH += (-0.3378547, -0.3453412, -0.3474797, -0.3481624, -0.3484207)
-"""u_y of the tip (m) at TIMES by Taylor-Hood elements, REFERENCE_CELLS, steps of 0.005 s (printed by --reference).
+"""u_y of the tip (m) at TIMES, from Taylor-Hood elements, REFERENCE_CELLS, steps of 0.005 s (printed by --reference).
 
 Steps of 0.0025 s change the last digit but one; 100 x 30 cells change the fifth digit.
 """
@@ -42,10 +42,10 @@ def arguments(argv: list[str] | None = None) -> Namespace:
     add("--dim", type=int, choices=(2, 3), default=2, help="plane strain, or one cell deep between smooth walls")
     add("--h", type=float, default=0.015, help="cell size, m")
     add("--dt", type=float, default=0.02, help="time step, s")
-    add("--rtol", type=float, help="choose the steps by their error instead")
+    add("--rtol", type=float, help="tolerance of adaptive steps, instead of equal steps")
     add("--method", choices=tuple(METHODS), default="sdirk2", help="time integration")
     add("--t-end", type=float, default=1.2, help="end time, s")
-    add("--ramp", type=float, default=0.06, help="time in which the load is raised, s")
+    add("--ramp", type=float, default=0.06, help="time in which the load increases, s")
     add("--load", type=float, default=54e3, help="load on the top, Pa, downwards")
     add("--bulk", type=float, default=1e7 / 3, help="drained bulk modulus, Pa")
     add("--shear", type=float, default=5e6, help="shear modulus, Pa")
@@ -57,15 +57,15 @@ def arguments(argv: list[str] | None = None) -> Namespace:
         "--quadrature",
         choices=("domain", "point"),
         default="domain",
-        help="exact domains, or points as in standard MPM",
+        help="exact integration of domains, or point quadrature as in standard MPM",
     )
-    add("--offset", type=float, default=0.5, help="of the beam's underside from a grid line, cells")
+    add("--offset", type=float, default=0.5, help="distance of the beam's underside from a grid line, cells")
     add("--box-scale", type=int, default=1, help="size of the background grid, in boxes of 1.5 m x 1.2 m")
     add("--coupling", choices=tuple(mpm.COUPLINGS), default="schur-cg", help="coupling scheme")
     add("--drained", action="store_true", help="no fluid at all")
-    add("--reference", action="store_true", help="run the Taylor-Hood finite elements beside it")
+    add("--reference", action="store_true", help="also compute the Taylor-Hood solution")
     add("--paraview", action="store_true", help="write points, grid and histories of every step to OUT/paraview")
-    add("--profile", action="store_true", help="print where the time went")
+    add("--profile", action="store_true", help="print the run time of each part of the program")
     options = parser.parse_args(argv)
     for name in ("h", "dt", "t_end", "ramp", "load", "box_scale"):
         if not getattr(options, name) > 0:
@@ -90,7 +90,7 @@ def physics(o: Namespace, dim: int = 2) -> dict:
 
 
 def material(o: Namespace) -> mpm.Hencky:
-    """Return the skeleton."""
+    """Return the soil skeleton of the beam."""
     return mpm.Hencky(bulk=o.bulk, shear=o.shear, porosity=o.porosity, conductivity=o.conductivity)
 
 
@@ -150,7 +150,7 @@ def main(argv: list[str] | None = None) -> dict:
         failure = None
         try:
             result = simulation.run(o.t_end, **output_times(o), probes=probes, observe=observers)
-        except mpm.GaveUp as error:  # what was found until then is shown
+        except mpm.GaveUp as error:  # the demo shows the results up to the failure
             failure, result = error, error.result
         result = replace(result, rows=[r._replace(displacement=r.displacement[:, [0, -1]]) for r in result.rows])
         out |= summary(simulation, result)
@@ -194,7 +194,7 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
 
 
 def report(o: Namespace, result: mpm.Result, fem) -> None:
-    """Print the tip's deflection, and the reference if there is one."""
+    """Print the tip deflection, and the reference deflection if it was computed."""
     rows = [["tip: t (s)", "u_x (m)", "u_y (m)", *(["FEM (m)", "difference"] if fem else [])]]
     every = max(1, len(result.t) // 12)
     for k in sorted({*range(1, min(4, len(result.t))), *range(every, len(result.t), every), len(result.t) - 1}):
@@ -215,7 +215,7 @@ def report(o: Namespace, result: mpm.Result, fem) -> None:
 
 
 def write_tables(o: Namespace, axis: np.ndarray, result: mpm.Result, fem) -> None:
-    """Write the tip's history and the deflection curves as CSV."""
+    """Write the history of the tip deflection, and the deflection curves, as CSV."""
     names = ["t_s", "ux_m", "uy_m", *([] if o.drained else ["p_min_Pa", "p_max_Pa"])]
     rows = []
     for k, t in enumerate(result.t):
@@ -228,13 +228,13 @@ def write_tables(o: Namespace, axis: np.ndarray, result: mpm.Result, fem) -> Non
 
 
 def draw_pressure(o: Namespace, snapshots: list) -> None:
-    """Draw the pore pressure on the material points at six times, in one range of colours."""
+    """Draw the pore pressure of the material points at six times, with one colour scale."""
     from matplotlib.colors import SymLogNorm
 
     rows = 1 + (len(snapshots) > 3)
     fig, axes = common.figure(rows, 3, (13, 3 * rows))
     limit = max(np.abs(pressure).max() for _, _, pressure in snapshots) / 1e3
-    colours = SymLogNorm(limit / 30, vmin=-limit, vmax=limit)  # what is left in the end is a fortieth
+    colours = SymLogNorm(limit / 30, vmin=-limit, vmax=limit)  # the final pressure is a fortieth of the largest
     low, high = snapshots[-1][1].min(axis=(0, 1)), snapshots[0][1].max(axis=(0, 1))
     for ax, (t, corners, pressure) in zip(axes.ravel(), snapshots, strict=False):
         domains = common.domains(ax, corners, pressure / 1e3, cmap="RdBu_r", linewidth=0.1, norm=colours)
@@ -249,7 +249,7 @@ def draw_pressure(o: Namespace, snapshots: list) -> None:
 
 
 def draw_deflection(o: Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
-    """Draw the beam's axis at several times, with Euler-Bernoulli and the finite elements."""
+    """Draw the axis of the beam at several times, with the Euler-Bernoulli beam and the finite elements."""
     import matplotlib
 
     fig, ((ax,),) = common.figure(1, 1, (8, 5))

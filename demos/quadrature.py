@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Exact integration of particle domains: the drained beam's tip against the number of load steps.
+"""Exact integration over particle domains: tip deflection of the drained beam against the number of load steps.
 
-The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material is elastic, so the
-deflection must not depend on n.  With integration over the exact pieces of the domains it does not.  With integration
-at the points, as in standard MPM, the deflection drifts with every cell that a point crosses.  The finite element
-reference takes the load in ten steps.
+The beam of `poroelastic_beam.py` without water is loaded in n equal steps.  The material is elastic, so the deflection
+must not depend on n.  With exact integration over particle domains, the deflection does not depend on n.  With point
+quadrature, as in standard MPM, the error of the deflection grows with every cell that a point crosses.  The finite
+element reference is computed in ten load steps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROBE = np.array([[beam.LENGTH, beam.HEIGHT / 2]])
 
 
 def tip(h: float, steps: int, quadrature: str) -> tuple[float, float]:
-    """Return (deflection of the tip in m, wall seconds); the deflection is nan if the run gave up."""
+    """Return (tip deflection, m, wall time, s); the deflection is nan if the run failed."""
     o = options(h, steps, quadrature)
     simulation, bottom = beam.scene(o)
     try:
@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, tips: dict[str, list[float]], exact: float) -> None:
-    """Draw the tip's deflection against the number of steps."""
+    """Draw the tip deflection against the number of steps."""
     fig, ((ax,),) = common.figure(1, 1, (7, 4.2))
     ax.axhline(exact, color="black", lw=1, label="Taylor-Hood FEM")
     ax.plot(o.steps, tips["domain"], "o-", label="exact pieces of the points' domains")

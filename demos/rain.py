@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: MIT
 """Rain on slopes that suction stabilises: factors of safety in time, with exact limits, and a bank that slides.
 
-A slope of 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  A column stands
-on a water table 5 m below the surface, under the component of gravity normal to the slope.  It starts at rest.  Then
-rain falls vertically, nine tenths of the conductivity, until the flow is steady.  At a depth d (vertical)
+A slope of 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  The scene is a
+column above a water table 5 m below the surface, under the component of gravity normal to the slope, initially in
+equilibrium.  Then vertical rain, at nine tenths of the conductivity, falls until the flow is steady.  At a vertical
+depth d the factor of safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
 
-with the suction stress chi s of Bishop and a constant unit weight gamma.  Before and after the storm this is exact for
-exponential soil: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), z above the table.
+with the suction stress chi s of Bishop and a constant unit weight gamma.  The suction s in exponential soil is known
+before the rain, and in steady rain q at a height z above the water table: exp(-alpha s / gamma_w) = q / k + (1 - q / k)
+exp(-alpha z cos^2 b).
 
-Source: Lu and Godt (2008) for vertical flow; normal to the slope, gravity is replaced by its component.  Errors: the
-largest error of FS at 1, 2, 3 and 5 m, at rest and at the end.
+Source: Lu and Godt (2008) for vertical flow; for flow normal to the slope, gravity is replaced by its normal component.
+Errors: the largest error of FS at 1, 2, 3 and 5 m, before the rain and in steady rain.
 
 With `--slope 10` rain falls on a bank of soil on rough rock, 5 m high, at 60 degrees.  Suction and a cohesion that
 vanishes with slip stabilise the bank.  The suction decreases until equilibrium is impossible.  With inertia the bank
-then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks: energies and
-water balance.  On 6 and 10 cells over its height it fails after 1.7 and 1.5 h, and runs out by 3.2 and 2.7 m.  On one
-process.
+then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks: energy balance
+and water balance.  With 6 and 10 cells over its height, the bank fails after 1.7 and 1.5 h, with run-outs of 3.2 and
+2.7 m.  On one process.
 """
 
 from __future__ import annotations
@@ -39,9 +41,9 @@ DAY = 86400.0  # s
 TIMES = (0.25, 0.5, 1.0, 2.0, 20.0)  # days
 BANK, BANK_ANGLE, CREST, RANGE = 5.0, np.radians(60.0), 3.0, 11.0  # m, -, m, m
 RAIN, LONGEST = 6e-5, 60e3  # m/s; s, in which the bank fails
-SLIDES, MOVES, REST = 5.0, 0.2, 0.05  # s; m, what has moved by more slides; m/s, slower than this it is at rest
+SLIDES, MOVES, REST = 5.0, 0.2, 0.05  # s; m: smallest displacement of a slide; m/s: largest speed at rest
 LEAKS = 2e-8  # of the water in the bank
-BALANCE = 0.01  # share of the work of the weight by which energies may be off
+BALANCE = 0.01  # allowed error of the energy balance, relative to the work of the weight
 
 
 def column(cells: int) -> mpm.Simulation:
@@ -134,13 +136,13 @@ def slide(o: Namespace) -> dict:
 
 
 def shot(s: mpm.Simulation) -> Shot:
-    """Return a shot of the present bank."""
+    """Return the present state of the bank for a picture."""
     speed = np.linalg.norm(s.points.data["velocity"], axis=1).max() if "velocity" in s.points.data else 0.0
     return Shot(s.t, s.points.corners.copy(), s.point_fields().saturation, float(speed))
 
 
 def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
-    """Draw the bank before the rain, at failure and at rest, and an animation; rained: number of shots to failure."""
+    """Draw the bank before the rain, at failure and at the end, and an animation; rained: states up to failure."""
     fig, (panels,) = common.figure(1, 3, (13, 3.2))
     failed = film[rained - 1].t
     titles = ("before the rain", f"{failed / 3600:.1f} h: it fails", f"{film[-1].t - failed:.0f} s later")
@@ -153,7 +155,7 @@ def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
 
 
 def bank_in(ax, one: Shot):
-    """Draw a shot of the bank; return the collection of domains."""
+    """Draw a state of the bank; return the collection of domains."""
     import matplotlib.pyplot as plt
 
     cmap = plt.get_cmap("viridis_r", 9)  # few colours: a small animation
@@ -164,7 +166,7 @@ def bank_in(ax, one: Shot):
 
 
 def animate(path: Path, film: list[Shot], rained: int) -> None:
-    """Draw hours of rain and seconds of the slide as an animation."""
+    """Draw the hours of rain and the seconds of the slide as an animation."""
     from PIL import Image
 
     fig, ((ax,),) = common.figure(1, 1, (5.6, 3.3))
@@ -206,7 +208,7 @@ def safety(depth: np.ndarray, suction_stress: np.ndarray) -> np.ndarray:
 
 
 def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return depths, m, heads, m, and suction stresses chi s, Pa, of the cells from the surface down."""
+    """Return depths, m, heads, m, and suction stresses chi s, Pa, of the cells, from the surface downwards."""
     cell = s.cells()
     depth = TABLE - cell.x[::-1, 1] / np.cos(SLOPE)
     p = cell.pressure[::-1]
@@ -260,7 +262,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list) -> None:
-    """Draw heads and factors of safety over the depth, with the exact ones at rest and in steady rain."""
+    """Draw heads and factors of safety over the depth, with exact values before the rain and in steady rain."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for days, depth, head, felt in curves:
         left.plot(head, depth, lw=1.4, label=f"{days:g} d")

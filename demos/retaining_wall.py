@@ -2,18 +2,18 @@
 """A rigid retaining wall tilts about its toe, away from the sand or into it: active and passive pressure.
 
 The sand carries a surcharge q and is weightless; phi = psi = 30 degrees.  It lies on a rough floor, and the friction
-angle of the wall is delta.  The wall tilts until a wedge of the sand flows, at the pressure K q, normal to the wall.
-With c cot(phi) added to both, which removes the effect of cohesion,
+angle of the wall is delta.  The wall tilts until a wedge of sand yields; the pressure normal to the wall is then K q.
+The effect of cohesion is removed by adding c cot(phi) to both pressures.  The exact coefficient is
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
-the upper sign passive: a zone at the wall, a fan about its crest and Rankine's zone (Prandtl, Sokolovskii).  Without
-friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the critical one with a
-plane slip surface.
+with the upper signs for passive pressure.  The solution consists of a zone at the wall, a fan about the crest of the
+wall, and Rankine's zone (Prandtl, Sokolovskii).  Without friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1
+∓ sin(phi)).  Coulomb's K is that of the critical wedge with a plane slip surface.
 
-The moment about the toe is conjugate to the rotation and gives K as well.  A tilting wall opens no gap at its toe.  A
-translating wall opens a gap and carries nothing there: without the last of ten cells, the active thrust is a tenth too
-small.  The sand is stiff.  At two and a half times the tilt, the active thrust rises by 2.5 to 3 %.
+K is also computed from the moment about the toe.  No gap opens at the toe of a tilting wall.  A translating wall opens
+a gap at its toe, and the lowest of ten cells carries no load: the active thrust is a tenth too small.  The sand is
+stiff.  At two and a half times the tilt of this demo, the active thrust is 2.5 to 3 % larger.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def exact(delta: float, way: int) -> float:
 
 
 def coulomb(delta: float, way: int) -> float:
-    """Return K of Coulomb's wedge."""
+    """Return K of Coulomb's critical wedge."""
     (p, d), angle = np.radians([PHI, delta]), np.radians(np.linspace(5, 85, 8001))
     K = np.cos(d) / np.tan(angle) * np.tan(angle + way * p)
     K /= np.cos(d) - way * np.sin(d) * np.tan(angle + way * p)
@@ -51,7 +51,7 @@ def coulomb(delta: float, way: int) -> float:
 
 
 def slip_line(delta: float, way: int) -> np.ndarray:
-    """Return the edge (n, 2), m, of the flowing sand, from the toe to the surface."""
+    """Return the edge (n, 2), m, of the yielding sand, from the toe to the surface."""
     p, d = np.radians([PHI, delta])
     fan, rankine = (np.arcsin(np.sin(d) / np.sin(p)) + way * d) / 2, np.pi / 4 - way * p / 2
     at_wall, apex = np.pi / 2 - rankine - fan, np.pi / 2 - way * p
@@ -119,7 +119,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[tuple[str, float], Tilted]) -> None:
-    """Draw the flowing sand with its exact edge, and K as the wall tilts."""
+    """Draw the yielding sand with its exact edge, and K against the tilt of the wall."""
     fig, axes = common.figure(len(runs), 2, (12, 2.5 * len(runs)))
     for (left, right), ((name, delta), run) in zip(axes, runs.items(), strict=True):
         corners, strain, wall = run.frame

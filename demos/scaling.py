@@ -2,27 +2,30 @@
 """Cost of a step: time of each part, memory and messages against the number of material points and processes.
 
 Two saturated bodies move slowly through the grid.  One is the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
-background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Every run is
-its own process, or several under mpirun (--processes 1 2).  The first step compiles and fills the caches.  Then single
-steps are measured.  The fastest is used, since other work on the machine only adds time.  Time is processor time,
-shared among the parts in proportion to the clock.  On several processes it is the largest time of all processes,
-including waits.  Memory is the peak since the start of the process, with libraries and compiler.  Under mpirun itself
-all runs share its processes, and memory is the peak so far.
+background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Every run
+has its own process, or several processes under mpirun (--processes 1 2).  The first step compiles forms and fills
+caches. Then single steps are measured, and the fastest is used, because other work on the machine only increases times.
+Times are processor times; the times of parts are in proportion to wall times.  On several processes, the largest time
+of all processes is used, including waits.  Memory is the peak since the start of the process, with libraries and
+compiler.  If the demo itself is started by mpirun, all runs use the same processes, and memory is the peak of all runs
+so far.
 
-The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the sizes.
-The memory's slope, `kB a point`, is over all sizes, by least squares of relative errors.  Runs on several processes
-also print the load balance (`imbalance`: largest number of pieces of a process over the mean) and the traffic of a
-step, the largest of all processes.  `exchange` is the traffic of the package (pieces, corners, points).  `solvers` is
-PETSc's count in set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
+The exponent of a part is the slope of log(time) against log(points), a least-squares fit to the upper half of the
+sizes. The slope of the memory, `kB a point`, is a fit to all sizes, by least squares of relative errors.  Runs on
+several processes also print `imbalance`, the largest number of pieces of a process divided by the mean.  They print the
+traffic of a step, the largest of all processes.  `exchange` is the traffic of the package (pieces, corners, points).
+`solvers` is PETSc's count in set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not
+counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
 
     T = e + a n / P + b H + c log2 P,
 
-a fixed cost, work of the points (of a run, times its imbalance), halo, and messages of any size.  All terms are >= 0,
-by least squares of relative errors.  H is the number of points along the faces between processes, for a cube that is
-halved repeatedly.  If a run has more processes than the machine has processors, its message counts are used, but not
-its times.  In 2D the solvers are left out: the cost of factorisations is not n / P.
+e is a fixed cost, a n / P the work of the points (multiplied by the imbalance of the run), b H the halo.  Messages cost
+c log2 P.  All coefficients are >= 0, from least squares of relative errors.  H is the number of points along the faces
+between processes, for a cube that is divided into halves repeatedly.  If a run has more processes than the machine has
+processors, its message counts are used, but not its times.  In 2D the model excludes the solvers, because the cost of
+factorisations is not proportional to n / P.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ SOLVERS = ("factorisation", "linear solve")
 
 
 def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
-    """Return a body of about a number of points, and its time step, s."""
+    """Return a scene with about a given number of points, and its time step, s."""
     if dim == 2:
         h = np.sqrt(4 * beam.LENGTH * beam.HEIGHT / points)
         return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02
@@ -81,14 +84,14 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
 
 
 def sent() -> np.ndarray:
-    """Return messages and bytes of the exchanges, and messages, bytes and reductions of the solvers so far."""
+    """Return numbers so far: messages and bytes of exchanges; messages, bytes and reductions of solvers."""
     events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
     solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
 
 
 def measure(dim: int, points: float) -> dict:
-    """Return the costs of the fastest step of a run; on all processes together."""
+    """Return the costs of the fastest step of a run.  All processes must call this function."""
     PETSc.Log.begin()
     began = time.perf_counter()
     simulation, dt = scene(dim, points)
@@ -125,11 +128,11 @@ def measure(dim: int, points: float) -> dict:
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
-    """Return the result of `measure` in its own process, or in several."""
+    """Return the result of `measure`, run in one or several new processes."""
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
-    # Open MPI: who waits leaves the processor to others, so that the time does not depend on other work
+    # Open MPI: a waiting process yields the processor, so that times do not depend on other work
     environment = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
@@ -141,7 +144,7 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return the exponents of the parts over the upper half of the sizes, and the memory: MB at first, kB a point."""
+    """Return exponents of the parts, fitted to the upper half of the sizes, and the memory: MB, and kB per point."""
     upper = rows[(len(rows) - 1) // 2 :]
     n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
     slope, base = np.polyfit(n, memory, 1, w=1 / memory)
@@ -167,7 +170,7 @@ def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[fl
 
 
 def modelled(row: dict) -> float:
-    """Return the seconds of a step that the cost model stands for."""
+    """Return the time of a step, s, to which the cost model is fitted."""
     return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
 
 
@@ -182,7 +185,7 @@ def fit(rows: list[dict]) -> dict[str, float]:
 
 
 def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> float:
-    """Return the predicted seconds of a step."""
+    """Return the predicted time of a step, s."""
     return float(np.dot(terms(dim, n, processes), [model[name] for name in "eabc"]))
 
 
@@ -248,7 +251,7 @@ def draw(out: Path, rows: list[dict]) -> None:
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
-    """Draw the longest parts, and time and memory in proportion to the points."""
+    """Draw the times of the most expensive parts, and lines proportional to the number of points."""
     n, found = np.array([row["points"] for row in rows]), exponents(rows)
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"

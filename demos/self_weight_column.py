@@ -2,15 +2,16 @@
 """A soft column settles to less than half its height under its own weight.
 
 A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  It stands between smooth walls.  Gravity,
-raised to 10 m/s² in equal steps, compresses it to 24.06 m, and its foot to 0.3 of its length, so points cross many
-cells.  The first Piola-Kirchhoff stress at the reference height Y carries the weight above, P = -rho0 g (l0 - Y).  In a
-column of constant width it equals Cauchy's stress.  Hencky's law gives the stretch by Lambert's W.  Source: the column
-of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On one process.
+increased to 10 m/s² in equal steps, compresses the column to 24.06 m.  The stretch at the foot is 0.3, so points cross
+many cells.  The first Piola-Kirchhoff stress at the reference height Y balances the weight above, P = -rho0 g (l0 - Y).
+In a column of constant width, this stress equals the Cauchy stress.  For Hencky's law the stretch is Lambert's W.
+Source: the column of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On
+one process.
 
-Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0), and the
-relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the initial height, 4.4e-4
-with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points instead of over the pieces of their
-domains.  Its error stays at some 8 % with any number of cells.
+Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted with their volumes; `height`
+is the relative error of the height.  With 16 and 64 cells over the initial height, stress errors published for GIMP are
+3.7e-3 and 4.4e-4; here they are 3.4e-4 and 6.4e-6.  `--quadrature point` integrates at the points instead of over their
+domains.  The stress error is then some 8 % with any number of cells.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ FOAM = mpm.Hencky(bulk=EXACT.bulk, shear=EXACT.shear, porosity=POROSITY, grain_d
 
 @dataclass
 class Outcome:
-    """The column at rest: initial heights Y and present ones y (n,), m, stress (n,), Pa, and volume0 of the points."""
+    """The settled column: initial heights Y, present heights y (n,), m, stress (n,), Pa, and volume0 of the points."""
 
     Y: np.ndarray
     y: np.ndarray
@@ -71,8 +72,8 @@ def errors(out: Outcome) -> dict[str, float]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=64, help="cells over the first height")
-    parser.add_argument("--steps", type=int, default=40, help="equal steps of gravity")
+    parser.add_argument("--cells", type=int, default=64, help="cells over the initial height")
+    parser.add_argument("--steps", type=int, default=40, help="equal steps in which gravity increases")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1")
@@ -89,7 +90,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome, rival: Outcome) -> None:
-    """Draw the stress over the present height, with the exact curve and that of standard MPM."""
+    """Draw the stress over the present height, with the exact curve and the result of standard MPM."""
     fig, ((ax,),) = common.figure(1, 1, (6.5, 5))
     Y = np.linspace(0, EXACT.l0, 201)
     ax.plot(EXACT.stress(Y) / 1e3, EXACT.position(Y), color="black", lw=1, label="exact")

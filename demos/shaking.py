@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A shear wave rises from the ground into a soft layer: amplification at its surface against the exact one.
+"""A shear wave rises from the ground into a soft layer: amplification at the surface, against the exact amplification.
 
 A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  An absorbing base 5 m below truncates the ground.  A
-shear pulse enters through the base, and reflections from layer and surface leave through it.  The sides have no
-vertical displacement, as in an infinite layer.  The reference is twice the incoming wave, the motion of a free surface
-of the ground alone.  The ratio of the spectrum of the surface to that of the reference is
+shear pulse enters through the base, and reflected waves leave through the base.  The sides have no vertical
+displacement, as in an infinite layer.  The reference motion is that of the free surface of the ground without layer:
+twice the incoming wave.  The amplification, the ratio of the spectra of surface and reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
@@ -20,10 +20,10 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground that is there
+LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground in the scene
 SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # of ground and layer: m/s, kg/m³, -
-PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: of Ricker's wavelet, its middle, and of the run
-BAND = (0.5, 6.5)  # Hz, in which spectra are compared
+PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: frequency and middle of Ricker's wavelet, duration of the run
+BAND = (0.5, 6.5)  # Hz: range in which spectra are compared
 BOUNDS = {"amplification": 0.03, "energy": 0.01}
 
 
@@ -41,7 +41,7 @@ def incoming(t: np.ndarray) -> np.ndarray:
 
 
 def shaken(cells: int, steps: int) -> tuple[mpm.Result, np.ndarray]:
-    """Return a run with numbers of steps and of cells over the layer, and the velocity of the surface, m/s."""
+    """Return a run with a number of steps, and of cells over the layer, and the velocity of the surface, m/s."""
     h = LAYER / cells
     rows = round(GROUND / h)
     grid = mpm.Grid([0, -GROUND - h], [4 * h, LAYER + h], [4, cells + rows + 2])

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Factor of safety of a slope, and its run-out after a larger loss of strength.
+"""Factor of safety of a slope, and run-out after a larger loss of strength.
 
 A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, without
 dilation.
 
-1. By how much may c and tan(phi) be divided?  `mpm.factor_of_safety` reduces the strength of the slope at rest, and
-   checks whether the stress in excess of the strength decays.  The best log-spiral mechanism gives 1.368, finite
-   elements 1.4 (Griffiths and Lane 1999).
-2. The strength is divided by 1.6 at once, in soil with the viscosity eta.  The slope slides until its new shape is
-   just stable: its factor of safety is then one, to a tenth.
+1. Factor of safety.  `mpm.factor_of_safety` divides c and tan(phi) of the slope at rest by trial factors, and checks
+   whether the viscous stress decays.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
+   Lane 1999).
+2. Run-out.  The strength is suddenly divided by 1.6, in soil with the viscosity eta.  The slope slides until its shape
+   is stable; the factor of safety of this shape differs from one by less than 0.1.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ def slope(cells: int) -> mpm.Simulation:
     )
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(grid, bodies, [soil], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)])
-    s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
+    s.run(1e9, 1e9, progress=False)  # time after which viscous stresses are negligible
     s.stage(reset_displacement=True)
     s.t = 0.0
     return s
 
 
 def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
-    """Divide the strength and let the slope run out: half of the steps of half a second each, then longer ones."""
+    """Divide the strength and let the slope run out; half of the steps are half a second long, the others longer."""
     friction = np.degrees(np.arctan(np.tan(np.radians(FRICTION)) / WEAKER))
     s.stage(fields={"friction": friction, "cohesion": COHESION / WEAKER})
     s.run(0.5 * steps, 0.5, progress=False)
@@ -74,7 +74,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--steps", type=int, default=40, help="steps of the slide")
-    parser.add_argument("--rtol", type=float, default=0.01, help="accuracy of the factor of safety")
+    parser.add_argument("--rtol", type=float, default=0.01, help="relative accuracy of the factor of safety")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or o.steps < 1 or not 1e-3 <= o.rtol <= 0.1:
         options = f"--cells {o.cells} --steps {o.steps} --rtol {o.rtol:g}"

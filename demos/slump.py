@@ -1,27 +1,29 @@
 # SPDX-License-Identifier: MIT
 """A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
 
-A bank of saturated soil, 10 m high and as long on a rough floor, stands with a vertical side under water.  Half of it
-is computed, x = 0 is a plane of symmetry.  Pressures are in excess of the water outside.  The weight is buoyant,
-gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On one process.
+A bank of saturated soil, 10 m high, stands under water on a rough floor, with vertical sides.  Half of the bank, 10 m
+long, is computed; x = 0 is a plane of symmetry.  Pressures are excess pressures relative to the water outside.  The
+weight is buoyant, gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On one process.
 
-1. Critical strength.  Without friction and drainage, the strength c is lowered by 1 % a step.  A vertical side of
+1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
    height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato 2000;
-   the best circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a step as at
-   first; 10 or 40 times change the result by 1 %.  With 10 and 20 cells over the height it fails at 3.93 and 3.85,
-   which is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value is 3.78.
-2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, far faster than it drains.
-   It slumps, and its crest rides on the flowing soil.  Before the toe, the water carries more than half of the weight.
-   At rest the bank reaches twice as far as before; then the excess pressure drains.  The final slope is 23.5 degrees,
-   and 29.3 over the steepest stretch of length H / 3.  The friction angle is 25 degrees; a Drucker-Prager cone without
-   dilation mobilises only arcsin(eta) = 24.2.  The remaining hundredth of the cohesion adds a little.  Twice the cells
-   or the steps, or half the viscosity, change run-out and height by less than 2 %.
+   the best circle: 3.83, Fellenius 1927).  Failure is a settlement of the crest 20 times as large as in the first
+   steps; with 10 or 40 times the result changes by 1 %.  With 10 and 20 cells over the height the bank fails at 3.93
+   and 3.85, which is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value
+   is 3.78.
+2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, much faster than the soil
+   drains.  The bank slumps, and the crest moves on top of the flowing soil.  In front of the toe, water carries more
+   than half of the weight.  The final length of the bank is twice the initial length; then the excess pressure drains.
+    The final slope is 23.5 degrees, and 29.3 degrees in the steepest section of length H / 3.  The friction angle is 25
+   degrees; a Drucker-Prager cone without dilation mobilises only arcsin(eta) = 24.2 degrees.  The remaining hundredth
+   of the cohesion adds a little.  Twice the number of cells or steps, or half the viscosity, change run-out and height
+   by less than 2 %.
 
-The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  An observer lowers it
-between two steps.  A step without convergence is cut and repeated with the same strength.  This helps because a viscous
-stress 2 eta D, a term in UFL like the weight, limits the velocity of the bank. eta / T is a hundredth of gamma' H; part
-1 has no viscosity.  A mesh could not represent this deformation: the side of the bank ends on the floor, at plastic
-strains of several hundred per cent.
+The cohesion is a function of position, so the points carry a cohesion (`points.data["cohesion"]`).  The function
+`observe` reduces this cohesion between two steps.  A step that does not converge is repeated with a shorter length and
+the same strength.  The shorter step converges because a viscous stress 2 eta D, a term in UFL, limits the velocity. eta
+/ T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation: the side of the
+bank ends on the floor, at plastic strains of several hundred per cent.
 """
 
 from __future__ import annotations
@@ -42,14 +44,14 @@ SCALE = WEIGHT * HEIGHT  # Pa
 SHEAR = 30 * SCALE
 FRICTION, CONDUCTIVITY = 25.0, 1e-9  # degrees, m/s
 STRONG, WEAK = 0.3 * SCALE, 0.01 * SCALE  # cohesion before and after, Pa
-DURATION = 600.0  # s, in which it is lost
+DURATION = 600.0  # s: time in which the cohesion is lost
 VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
 THEORY, RUNAWAY = 3.78, 20
 CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank, with cells over its height and `room` m before it, and a probe on its crest."""
+    """Return the consolidated bank, with cells over its height and `room` m in front, and a probe on the crest."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -64,18 +66,18 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
     )
     walls = {"left": "x", "bottom": "xy"}
     simulation = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls=walls, **scene)
-    simulation.run(1e12, 1e12, progress=False)  # time enough for the water to leave, where it can
+    simulation.run(1e12, 1e12, progress=False)  # long compared with the time of drainage
     simulation.stage(reset_displacement=True)
     simulation.t = 0.0
     return simulation, mpm.probes([body], [[length, HEIGHT]])
 
 
-# ---- 1. the strength at which it fails ------------------------------------------------------------
+# ---- 1. the strength at failure - ------------------------------------------------------------
 
 
 @dataclass
 class Failure:
-    """Stability numbers gamma H / c (n,), the crest's settlement in each step over that in the first five (n,).
+    """Stability numbers gamma H / c (n,), and settlements per step, divided by that in the first five steps (n,).
 
     critical: the number at which the bank fails.
     """
@@ -87,7 +89,7 @@ class Failure:
 
 
 def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
-    """Lower the strength of an undrained bank without friction until its crest settles without bound."""
+    """Reduce the strength of an undrained bank without friction until the crest settles without bound."""
     s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[common.weight(WEIGHT)])
     number, settlement, rate = [start], [0.0], np.zeros(0)
     while len(rate) < 10 or rate[-1] < 2 * RUNAWAY:
@@ -143,7 +145,7 @@ class Frame:
 class Slump:
     """Results of a run; `rest` and `drained` are the indices of the frames at which the two stages end.
 
-    alternating: largest rms, Pa, of the part of the pressures before the bank that alternates from cell to cell.
+    alternating: largest rms, Pa, of pressures in front of the bank that alternate from cell to cell.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -157,7 +159,7 @@ class Slump:
 
 
 def alternating(p: np.ndarray) -> np.ndarray:
-    """Return the part of cells' values (n, m) that alternates along both axes (n - 2, m - 2)."""
+    """Return the alternating part, along both axes, (n - 2, m - 2) of the cells' values (n, m)."""
     for axis in (0, 1):
         q = np.moveaxis(p, axis, 0)
         p = np.moveaxis((2 * q[1:-1] - q[:-2] - q[2:]) / 4, 0, axis)
@@ -165,7 +167,7 @@ def alternating(p: np.ndarray) -> np.ndarray:
 
 
 def at_toe(s: mpm.Simulation) -> float:
-    """Return the rms, Pa, of the alternating part of the pressures in cells before the bank's first side."""
+    """Return the rms, Pa, of alternating pressures in cells in front of the initial side of the bank."""
     cells, p = s.cells(), np.full(tuple(s.grid.shape), np.nan)
     p[tuple(s.grid.index(cells.x).T)] = cells.pressure
     found = alternating(p)[round(HEIGHT / s.grid.h[0]) - 1 :]
@@ -196,7 +198,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the strength at the end of the next step."""
+        """Set the strength that the soil has at the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 
@@ -216,7 +218,7 @@ def slump(cells: int, steps: int) -> Slump:
     return out
 
 
-# ---- what comes of it -----------------------------------------------------------------------------
+# ---- results -----------------------------------------------------------------------------
 
 
 def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
@@ -240,7 +242,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
-    parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost")
+    parser.add_argument("--steps", type=int, default=100, help="number of steps in which the cohesion decreases")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 10:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, and >= 10")
@@ -279,14 +281,14 @@ def report(run: Slump, found: dict[str, float]) -> None:
 
 
 def stages(run: Slump) -> dict[str, int]:
-    """Return names and frames of the stages that are shown."""
+    """Return names and frames of the stages in the picture."""
     lost = np.array([f.cohesion for f in run.frames])
     weak = int(np.argmax(lost <= 1.001 * WEAK))
     return {"failing": int(0.6 * weak), "slumping": int(0.9 * weak), "at rest": run.rest, "drained": run.drained}
 
 
 class Panel:
-    """A frame on axes: values on the domains, and the surface."""
+    """A frame drawn on axes: values of the domains, and the surface."""
 
     def __init__(self, ax, frame: Frame, values: np.ndarray, **style):
         from matplotlib.collections import PolyCollection
@@ -305,7 +307,7 @@ class Panel:
 
 
 def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values that are drawn: pressure, kPa, and plastic strain."""
+    """Return the values to draw: pressure, kPa, and plastic strain."""
     return frame.pressure / 1e3, np.maximum(frame.strain, 1e-3)
 
 
@@ -358,7 +360,7 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
 
 
 def animate(path: Path, run: Slump) -> None:
-    """Draw the slump as an animation, whose clock runs faster from part to part."""
+    """Draw the slump as an animation; each part runs faster than the part before."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     weak = int(np.argmax([f.cohesion <= 1.001 * WEAK for f in run.frames]))

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Error as the time step tends to zero: it becomes the spatial error, at rest and in motion.
+"""Error as the time step tends to zero: only the spatial error remains, also in a moving body.
 
-Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1
-to 1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, at the
-centroid of each cell.  The error of time integration falls with the step.  The remaining error must be the spatial
-error, which an exact solution in time of the semi-discrete equations gives.  The spatial error must stay constant for
-any number of steps: a pressure averaged to points and back in every step would diffuse.  Three columns:
+Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, so
+T_v increases by 0.1 to 1e-5 in a step.  The error is the rms of p - exact at the centroids of the cells, divided by p0.
+The error of time integration decreases with the step.  The remaining error must be the spatial error, known from
+semi-discrete equations that are solved exactly in time.  This error must not grow with the number of steps.  A pressure
+that is averaged from cells to points and back in every step would diffuse.  There are three columns:
 
-* resting on the grid;
+* resting: the column does not move through the grid;
 * moving: during consolidation the base moves down by half the height, through half of all cells;
-* moving, soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of stiff water follows from the
-  strain of the points.  The pressure of soft water is also remapped from grid to grid.
+* moving, soft water: the storage coefficient of the water equals that of the skeleton, S = 1/M.  The pressure of stiff
+  water follows from the strain of the points.  The pressure of soft water is also remapped at each grid reset.
 
 Motion adds an error, because all points of a cell have the same strain increment in a step.  This error is largest at
-the drained top, in cells with little of the column.  The error of the remap itself is of second order and smaller.
+the drained top, in nearly empty cells.  The error of the remap itself is second order and smaller.
 
-The overshoot, the largest p / p0 - 1 of all steps, is zero at rest for any step.  So the scheme has no smallest time
-step in one dimension.  In more dimensions, small steps cause checkerboard modes of the pressure, unless its jumps are
-damped (`storage.py`).  The demo shows them for a strip load on a layer in a rough box, first step, with and without
-damping.  On one process.
+The overshoot, the largest p / p0 - 1 of all steps, is zero in the resting column for any step size.  In one dimension
+the scheme therefore has no smallest time step.  In more dimensions, small steps cause checkerboard modes of the
+pressure, unless pressure jumps are damped (`storage.py`).  The demo shows these modes with and without damping, after
+the first step under a strip load on a layer in a rough box.  On one process.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""Displacement of the base over the height, and the water's storage coefficient times M."""
-STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the layer's time of consolidation
+"""Base displacement divided by the column height; storage coefficient of the water times the oedometric modulus M."""
+STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # fraction of the layer's time of consolidation
 
 
 @dataclass
 class Run:
-    """A column at T_END: depth z of the cells' centroids over the height, p / p0, errors as the module says."""
+    """A column at T_END: depth z of the cells' centroids divided by the height, p / p0, and the error."""
 
     z: NDArray[np.float64]
     p: NDArray[np.float64]
@@ -74,7 +74,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
     simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
     scene, (on_grid, _) = simulation.scene, simulation.scene.last
     here = on_grid.contents.filled
-    # the cells hold what they held at the start of the last step
+    # cells contain the points of the start of the last step
     y = (grid.base + grid.midpoints[here] + on_grid.contents.centroid[here])[:, 1] + way * HEIGHT * (1 - 1 / steps)
     z, p = np.clip(1 - y / HEIGHT, 0, 1), scene.storage.p.x.array[here] / p0
     volume = scene.momentum.ghost.fill.x.array[here]
@@ -84,7 +84,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
 
 
 def error_of_cells(cells: int) -> float:
-    """Return the same error on equal cells for exact time integration: two-point fluxes and damping of small steps."""
+    """Return the error on equal cells for exact time integration of two-point fluxes and damping."""
     laplacian = 2 * np.eye(cells) - np.eye(cells, k=1) - np.eye(cells, k=-1)
     laplacian[0, 0] = laplacian[-1, -1] = 1
     outflow = laplacian.copy()
@@ -96,7 +96,7 @@ def error_of_cells(cells: int) -> float:
 
 
 def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]:
-    """Return p / load (nx, ny) after the first step, dt over the time of consolidation, under a strip load."""
+    """Return p / load (nx, ny) after the first step under a strip load; dt: divided by the time of consolidation."""
     grid = mpm.Grid([0, 0], [2 * HEIGHT, HEIGHT], [2 * cells, cells])
     soil = law(bulk=SOIL.bulk, shear=SOIL.shear, porosity=SOIL.porosity, conductivity=SOIL.conductivity)
     load = 1e-5 * SOIL.oedometric

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Large consolidation under a strip load: a layer as deep as wide settles by an eighth, and its porosity falls.
+"""Large consolidation under a strip load: a square layer settles by an eighth of its height, and porosity decreases.
 
-A layer between smooth walls on a smooth, impervious base carries a dead load q on a fifth of its drained surface.
-Half of it is computed, x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6.  Its
+A layer between smooth walls on a smooth, impervious base carries a dead load q on a fifth of its drained surface. Half
+of the layer is computed; x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6.  Its
 conductivity k0 10^(5 (J - 1)) falls as pores close.  Grains and water are incompressible.  T = k0 E t/(gamma_w H²) is
-the reduced time, and the load rises until T = 0.01.  After Carter, Small and Booker (1977), in the form of Abaqus'
-benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, where a law without
-stiffness of the grains fails.  The package reports it, and the demo shows its results up to then.
+the reduced time, and the load rises until T = 0.01.  The case is that of Carter, Small and Booker (1977), as in Abaqus'
+benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, and a law without stiffness of
+the grains fails.  The package reports this failure, and the demo shows the results up to this time.
 
 Checks for q/E = 0.25 use Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80 cells.  The
-extrapolation moves the result of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  `settlement` is the largest
-error of the middle's displacement from T = 0.1 on, `at_once` the error at T = 0.01.  `edge` refers to the strip's
-edge, where the load jumps, and `beside` to the far corner.  All are relative to the middle.  --reference runs such
-elements on the same cells. On one process.
+extrapolation moves the result of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  `at_once` is the
+error of the displacement of the middle at T = 0.01, `settlement` the largest error from T = 0.1 on.  `edge` is the
+largest error at the edge of the strip, where the load jumps, and `beside` that at the far corner, from T = 0.1 on.  All
+errors are relative to the displacement of the middle.  --reference runs Taylor-Hood elements on the same cells.  On one
+process.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-HEIGHT, STRIP, E, K0 = 1.0, 0.2, 1e6, 1e-6  # m, of the layer and of half the strip; Pa; m/s
+HEIGHT, STRIP, E, K0 = 1.0, 0.2, 1e6, 1e-6  # m: height of the layer, half-width of the strip; Pa; m/s
 WATER = mpm.Fluid(bulk=np.inf)
 SOIL = mpm.Hencky(
     bulk=E / 3,
@@ -51,27 +52,27 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Upward displacements (TIMES, PLACES) over HEIGHT, of Taylor-Hood elements for q/E = 0.25, extrapolated."""
+"""Upward displacements (TIMES, PLACES) divided by HEIGHT; Taylor-Hood elements for q/E = 0.25, extrapolated."""
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def conditions(load: float) -> dict:
-    """Return the conditions, load over E."""
+    """Return the conditions; load: divided by E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
     return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the ends T of the steps: up to RAMP, two thirds of the number of steps in each later decade."""
+    """Return the ends T of the steps; up to RAMP, two thirds of the number of steps in each later decade."""
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
 
 
 @dataclass
 class Outcome:
-    """Histories: T, and upward displacements of PLACES over HEIGHT.
+    """Histories: T, and upward displacements of PLACES divided by HEIGHT.
 
-    frames: T, corners, pressure over E and porosity of the points; why: reason of an early end.
+    frames: T, corners, pressure divided by E and porosity of the points; why: reason of an early end.
     """
 
     T: list[float] = field(default_factory=list)
@@ -84,7 +85,7 @@ class Outcome:
 
 
 def run(cells: int = 40, load: float = 0.25, a_decade: int = 30) -> Outcome:
-    """Consolidate a layer, `cells` cells high, under a load over E."""
+    """Consolidate a layer, `cells` cells high; load: divided by E."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [HEIGHT, HEIGHT + 4 * h], [cells, cells + 4])
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
@@ -111,7 +112,7 @@ def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the upward displacements (times, PLACES) of Taylor-Hood elements over HEIGHT, at TIMES."""
+    """Return the upward displacements (times, PLACES) of Taylor-Hood elements divided by HEIGHT, at TIMES."""
     fem, out = BiotFEM([0, 0], [HEIGHT] * 2, [cells] * 2, SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)
@@ -133,8 +134,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--load", type=float, default=0.25, help="q/E")
-    parser.add_argument("--steps", type=int, default=30, help="in each decade of T from 0.01 on")
-    parser.add_argument("--reference", action="store_true", help="run Taylor-Hood elements on the same cells, too")
+    parser.add_argument("--steps", type=int, default=30, help="steps in each decade of T from 0.01 on")
+    parser.add_argument("--reference", action="store_true", help="also run Taylor-Hood elements on the same cells")
     o = parser.parse_args(argv)
     if o.cells < 5 or not 0 < o.load <= 1 or o.steps < 4 or o.steps % 2:
         parser.error(f"--cells {o.cells} --load {o.load} --steps {o.steps}: must be >= 5, in (0, 1], even and >= 4")
@@ -158,7 +159,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the initial pressure, the final porosity, and the displacements of the surface over time."""
+    """Draw initial pressure, final porosity, and displacements of the surface against time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (14, 4.4))
     kinds = (("pore pressure / E (-)", 2, "viridis"), ("porosity (-)", 3, "cividis"))
     for ax, (T, *values), (label, k, colours) in zip(

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Write the figures of README.md and demos/README.md from the output of the demos.
+"""Write the numbers in the tables of README.md and demos/README.md from the output of the demos.
 
-A comment follows each figure.  It names the run of a demo, the entries of its JSON output, and a format:
+A comment follows each number.  The comment names the run of a demo, the entries of its JSON output, and a format:
 
-    | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
+    | Terzaghi's column, pressure at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
-demos/results keeps the output of the demos, with the run time in `seconds` and the release of dolfinx.  demos/pictures
-keeps the pictures of the first run on the pages.  The table of a demo's file stands between
-`<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
+demos/results contains the output of the demos, with the run time in `seconds` and the release of dolfinx.
+demos/pictures contains the pictures of the first run of each demo on the pages.  A table that a demo writes as a file
+stands between `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
-    bash demos/run.sh tables                        # writes the figures anew from demos/results
+    bash demos/run.sh tables                        # writes the numbers from demos/results
     bash demos/run.sh tables --run terzaghi mandel  # runs these demos first; `--run all` takes hours
 """
 
@@ -42,7 +42,7 @@ def kept(run: str) -> Path:
 
 
 def figure(value: float, form: str) -> str:
-    """Return a number in one of the forms of the pages: %, +%, min (a time), or a format of Python."""
+    """Return a number as text in the format of its comment: %, +%, min (a time), or a Python format."""
     if form.endswith("%"):
         return f"{100 * value:{form[:-1]}.2g}"
     if form == "min":
@@ -51,7 +51,7 @@ def figure(value: float, form: str) -> str:
 
 
 def figures(run: str, entries: str, form: str) -> str:
-    """Return the figures that a comment asks for."""
+    """Return the numbers that a comment names, as text."""
     if not kept(run).exists():
         sys.exit(f"{kept(run)}: missing: bash demos/run.sh tables --run {run.split()[0]}")
     printed, values = json.loads(kept(run).read_text()), []
@@ -64,13 +64,13 @@ def figures(run: str, entries: str, form: str) -> str:
 
 
 def written(page: str) -> str:
-    """Return a page with its figures and tables written again."""
+    """Return the text of a page with new numbers and tables."""
     page = FIGURE.sub(lambda m: f"{figures(m['run'], m['entries'], m['form'])} {m['comment']}", page)
     return TABLE.sub(lambda m: m["begin"] + kept(m["run"]).with_suffix(".md").read_text() + m["end"], page)
 
 
 def runs(pages: Iterable[str]) -> dict[str, str]:
-    """Return the runs that pages tell of, with the tables that they write, or nothing."""
+    """Return the runs that comments on the pages name, each with the table that it writes, or nothing."""
     found = {}
     for page in pages:
         found |= {m["run"]: "" for m in FIGURE.finditer(page) if m["run"] not in found}
@@ -79,7 +79,7 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
 
 
 def take(run: str, table: str, pictures: bool) -> None:
-    """Run a demo, and keep its output, its table, and, if asked to, its pictures on the pages."""
+    """Run a demo; store its output, its table and, if requested, its pictures for the pages."""
     import dolfinx
 
     demo, *options = shlex.split(run)
@@ -103,16 +103,18 @@ def take(run: str, table: str, pictures: bool) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run demos if asked to, and write the pages."""
+    """Run demos if requested, and write the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="run what is told of these first, or all")
+    parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="first run these demos, or all")
     o = parser.parse_args(argv)
     told = runs(page.read_text() for page in PAGES)
     demos = {shlex.split(run)[0] for run in told}
     for name in o.run:
         if name not in demos | {"all"}:
             parser.error(f"--run {name}: must be all, or among {', '.join(sorted(demos))}")
-    drawn = {demo: run for run in reversed(told) for demo in shlex.split(run)[:1]}  # a demo's first run draws
+    drawn = {
+        demo: run for run in reversed(told) for demo in shlex.split(run)[:1]
+    }  # the first run of a demo makes the pictures
     for run, table in told.items():
         if {"all", demo := shlex.split(run)[0]} & {*o.run}:
             print(run, flush=True)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Terzaghi's consolidation: a saturated layer is loaded at once and drains at its top.
+"""Terzaghi's consolidation: a saturated layer is loaded suddenly and drains at its top.
 
-A column of 1 m between smooth walls, impervious at its foot, takes a load p0 in its first step.  At first the
-incompressible pore water carries all of it, p = p0.  As it drains, the skeleton takes over: dp/dt = c_v d²p/dz², c_v
-= kappa (K + 4G/3).  The load strains the skeleton by 1e-5, so small-strain theory is accurate.  T_v = c_v t / height²
-is the reduced time.  Source: Terzaghi (1923); the series in Verruijt, Theory and Problems of Poroelasticity (2016).
-On one process.
+A load p0 acts on a column of 1 m between smooth walls, impervious at its foot, from the first step on.  Initially the
+incompressible pore water carries the whole load, p = p0.  During drainage the load is transferred to the skeleton:
+dp/dt = c_v d²p/dz², c_v = kappa (K + 4G/3).  The load strains the skeleton by 1e-5, so small-strain theory is accurate.
+T_v = c_v t / height² is the reduced time.  Source: Terzaghi (1923); the series in Verruijt, Theory and Problems of
+Poroelasticity (2016). On one process.
 
-Errors: the largest over the depth of |p - exact| / p0 at T_v = 0.1, 0.5 and 1, at the centroid of each cell, and the
-relative error of the `settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.
+Errors: the largest |p - exact| / p0 of all cells, at centroids, at T_v = 0.1, 0.5 and 1, and the relative error of the
+`settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation, terzaghi_pressure
 
 HEIGHT = 1.0  # m
-SAMPLES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # T_v of the curves that are drawn
+SAMPLES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # T_v of the curves in the picture
 SOIL = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 WATER = mpm.Fluid(bulk=np.inf)
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
@@ -32,7 +32,7 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """Results of a run, by output time: T_v, depth and p of the cells, settlement, over their scales."""
+    """Dimensionless results at each output time: time factor T_v, depths and pressures of the cells, settlement."""
 
     result: mpm.Result
     time: list[float] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Outcome:
     settlement: list[float] = field(default_factory=list)
 
     def at(self, time: float) -> int:
-        """Return the entry nearest to a T_v."""
+        """Return the index of the output time nearest to T_v."""
         return int(np.argmin(np.abs(np.array(self.time) - time)))
 
 
@@ -50,7 +50,7 @@ def run(
 ) -> Outcome:
     """Consolidate a column of `cells` cells to T_v = 1 under a load that strains it by `strain`.
 
-    In equal steps, or with `rtol` in steps chosen by their error.
+    Steps are equal, or adaptive with the tolerance `rtol`.
     """
     h, load = HEIGHT / cells, strain * SOIL.oedometric
     grid = mpm.Grid([0, 0], [h, HEIGHT], [1, cells])
@@ -95,7 +95,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="equal steps to T_v = 1")
-    parser.add_argument("--rtol", type=float, help="choose the steps by their error instead")
+    parser.add_argument("--rtol", type=float, help="tolerance of adaptive steps, instead of equal steps")
     parser.add_argument("--method", choices=tuple(METHODS), default="sdirk2", help="time integration")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10:
@@ -111,7 +111,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the depth and the settlement over time, with the exact curves."""
+    """Draw the pressure over the depth and the settlement against time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, time in enumerate(SAMPLES):

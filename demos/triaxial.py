@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Triaxial tests of soil laws at a point against closed forms: a check of a law before its use.
+"""Triaxial tests of soil laws at a point, against closed-form solutions.
 
 Modified Cam Clay at three overconsolidation ratios, drained and undrained, starts from the same isotropic stress.
-Undrained the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  On the way
-Q = M sqrt(P (P_c - P)).  Drained the path is q = 3 (p - p_0), and ends where it meets q = M p.  Mohr-Coulomb sand ends
+In undrained tests the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  During
+yield Q = M sqrt(P (P_c - P)).  The drained stress path is q = 3 (p - p_0), and ends at q = M p.  Mohr-Coulomb sand ends
 at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in Kirchhoff stresses, in compression and in extension.
 
 Errors are relative, and refer to the final states.
 
 --cost N compresses a block of N x N cells of Drucker-Prager, Mohr-Coulomb and Cam Clay soil until all of it yields.
-Steps alternate, and the demo prints the processor time of a step over that of Drucker-Prager soil.
+Steps alternate between the laws.  The demo prints the processor time of a step, divided by that of Drucker-Prager soil.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def end_of(kind: str, R: float) -> float:
 
 
 def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
-    """Return the distance of the final stresses of the sand from the Mohr-Coulomb surface, over the cell pressure."""
+    """Return the distance of the sand's final stresses from the Mohr-Coulomb surface, divided by the cell pressure."""
     out = {}
     for strain, r in tests.items():
         tau = np.sort(np.diag(r.stress[-1])) * np.linalg.det(r.F[-1])
@@ -54,19 +54,19 @@ def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
 
 
 def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
-    """Return a block under p_0 on its free side, which is compressed by a thousandth of its height in a second."""
+    """Return a block with p_0 on its free side, compressed by a thousandth of its height per second."""
     h = 1 / cells
     grid = mpm.Grid([0] * 2, [1 + 2 * h] * 2, [cells + 2] * 2)
     squeeze = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
     walls, load = {"left": "x", "bottom": "y"}, mpm.Pressure("right", P0)
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [soil], walls=walls, conditions=[squeeze, load])
-    if not isinstance(soil, mpm.ModifiedCamClay):  # sand begins with its pressure as elastic strain
+    if not isinstance(soil, mpm.ModifiedCamClay):  # the initial pressure of sand is given as elastic strain
         s.stage(fields={"plastic": np.exp(-2 * P0 / (3 * soil.bulk)) * np.eye(3)})
     return s
 
 
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
-    """Return the processor time of a step over that of Drucker and Prager's soil; each law takes a step in turn.
+    """Return the processor time of a step, divided by that of Drucker-Prager soil; steps of the laws alternate.
 
     Sands have associated flow; otherwise shear bands form in the uniform block.
     """
@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--steps", type=int, default=100, help="steps of a test")
-    parser.add_argument("--cost", type=int, metavar="N", help="also print what a step costs, N x N cells")
+    parser.add_argument("--cost", type=int, metavar="N", help="also print the cost of a step, N x N cells")
     o = parser.parse_args(argv)
     for name, value in (("steps", o.steps), ("cost", o.cost)):
         if value is not None and value < 1:
@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict[float, mpm.ElementTest]) -> None:
-    """Draw stress paths, stress and strain, pore pressures and volumes."""
+    """Draw stress paths, stress-strain curves, pore pressures and volumes."""
     fig, ((path, curve), (water, sand)) = common.figure(2, 2, (11, 7.5))
     for (kind, R), r in tests.items():
         drained, colour = kind == KINDS[0], f"C{RATIOS.index(R)}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The method, from one cut domain to a consolidating column, to be read from top to bottom.
+"""The method, from one particle domain cut by the grid to a consolidating column; read it from top to bottom.
 
 You need to know FEniCSx, but nothing of this package.  Each part prints its result and ends in an assertion.  On one
 process.
@@ -29,8 +29,9 @@ out = parser.parse_known_args()[0].out  # a notebook has options of its own
 
 # 1. A domain, cut by the grid.
 #
-# The grid is a box of equal cells, a dolfinx mesh.  A material point represents a quadrilateral, its domain, and the
-# package tracks the corners.  Corner k is at the lower or upper end of each axis: (0, 0), (1, 0), (0, 1), (1, 1).
+# The grid is a box of equal cells, a dolfinx mesh.  A material point represents a quadrilateral, its domain.  The
+# package tracks the corners of the domain.  Corner k is at the lower or upper end of each axis: (0, 0), (1, 0), (0, 1),
+# (1, 1).
 
 grid = mpm.Grid(lower=[0, 0], upper=[0.4, 1.2], cells=[4, 12])
 domain = np.array([[[0.07, 0.22], [0.25, 0.26], [0.04, 0.36], [0.25, 0.46]]])

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Contact of two gels: they are pressed together, slide with friction, and separate.
 
-Two half-discs are groups of bodies, each with its own displacements.  The lower one is fixed, the upper one follows a
-path.  While they are apart no force acts between them, however narrow the gap.  As the upper one passes over the top of
-the lower one, the contact inclines.  The force along the path, over the vertical force, then falls below the friction
-coefficient.
+Two half-discs are groups of bodies, each with its own displacements.  The lower gel is fixed, the upper gel follows a
+path.  No force acts between separated gels, however narrow the gap.  As the upper gel passes over the top of the lower
+gel, the contact surface becomes inclined.  The ratio of the force along the path to the vertical force is then below
+the friction coefficient.
 
-A second scene is the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the actual
-force of the contact.  The errors of both are due to the small number of cells over the half-width.
+A second scene is the contact of a curved and a flat elastic body.  Largest pressure and half-width are compared with
+Hertz, for the computed contact force.  The errors of both are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHOWN = (0.0, 1.0, 2.0, 3.0)
 
 
 def half_disc(grid: mpm.Grid, centre: tuple[float, float], up: float):
-    """Return a half-disc with its flat side at its centre, whose round side faces up (1) or down (-1)."""
+    """Return a half-disc about `centre`.  Its round side faces up (up = 1) or down (-1)."""
     flat = mpm.box(grid, [centre[0] - RADIUS, min(centre[1], centre[1] + up)], np.add(centre, [RADIUS, max(up, 0)]))
     return mpm.mapped(grid, flat, lambda x: centre + _round((x - centre) / RADIUS) * RADIUS)
 
@@ -59,7 +59,7 @@ def scene(cells: int) -> mpm.Simulation:
 
 
 def hertz(cells: int) -> dict[str, float]:
-    """Return cells over the half-width, and the errors of the largest pressure and the half-width, relative."""
+    """Return the number of cells over the half-width, and relative errors of largest pressure and half-width."""
     E, nu, R, L = 1e6, 0.3, 20.0, 4.0
     stiff, top, n = E / (1 - nu**2) / 2, L + 0.3 / cells, [round(L * cells), round((2 * L + 2) * cells)]
     grid = mpm.Grid([0, 0], [L, 2 * L + 2], n)
@@ -86,7 +86,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel")
-    parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies")
+    parser.add_argument("--hertz", type=int, default=18, help="cells per metre of the elastic bodies")
     o = parser.parse_args(argv)
     if min(o.cells, o.hertz) < 4:
         parser.error(f"--cells {o.cells} --hertz {o.hertz}: must be >= 4")

@@ -2,12 +2,13 @@
 """Vibration of a beam and a bar: frequencies, and loss of energy, against exact values.
 
 1. A clamped beam, 1 x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
-   theory is accurate.  Its first bending frequency is 3.24419 Hz, by spectral elements graded to the clamp's corners.
-   The first axial one is c / (4 L) = 17.67767 Hz, exactly.  The frequencies of the tip are fitted over three periods.
-2. A free bar, P = E (F - 1), vibrates with strains of 5 % and moves over fifty cells in 25 periods.  In the exact
-   solution the ends oscillate about the uniform motion by A / (pi c) sin(pi c t / L), without loss of energy.  SDIRK2
-   itself loses gamma^4 y^4 / (1 + gamma^2 y^2)^2, y = omega dt, of the energy in a step.  The remaining loss is due to
-   resets of the grid.
+   theory is accurate.  The first bending frequency is 3.24419 Hz, from spectral elements graded towards the corners
+   of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767 Hz.  Frequencies are fitted to the motion of
+   the tip in three periods.
+2. A free bar, P = E (F - 1), vibrates with strains of 5 % and moves through fifty cells in 25 periods.  In the exact
+   solution the ends oscillate about the uniform motion by A / (pi c) sin(pi c t / L), without loss of energy.  In each
+   step, SDIRK2 itself loses the fraction gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy, y = omega dt.  The remaining
+   loss is due to resets of the grid.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from mpm_dolfinx.base.time_integration import GAMMA
 LENGTH, DEPTH = 1.0, 0.3  # m, of the beam
 BEAM = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, grain_density=4000.0, porosity=0.5)  # nu = 0, 2000 kg/m³
 EXACT = {"across": 3.2441904, "along": 17.6776695}  # Hz
-AMPLITUDE = 0.05  # of the bar: velocity over that of its waves
-LOST = 0.02  # share of the bar's energy that may be lost in 25 periods of 40 steps
+AMPLITUDE = 0.05  # velocity of the bar, divided by its wave velocity
+LOST = 0.02  # allowed energy loss of the bar in 25 periods of 40 steps
 
 
 class Bar(mpm.LinearElastic):
@@ -59,7 +60,7 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar; return times in periods, the oscillation of its end, m, and energy over the initial one."""
+    """Move the free bar; return times in periods, the oscillation of its end, m, and its energy ratio to the start."""
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
     low, speed = 2.3 * h, 2.5 / (2 * periods)  # over 2.5 lengths
@@ -80,7 +81,7 @@ def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def own_loss(t: np.ndarray, steps: int) -> np.ndarray:
-    """Return the energy ratio that SDIRK2 retains after t periods, with a number of steps in each."""
+    """Return the fraction of the energy that SDIRK2 retains after t periods, with a number of steps in each."""
     y = (GAMMA * 2 * np.pi / steps) ** 2
     return (1 - (y / (1 + y)) ** 2) ** (t * steps)
 
@@ -89,11 +90,11 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
-        "--h", type=float, nargs="+", default=[0.1, 0.05], help="cells of the beam, m; 0.3 / h is whole"
+        "--h", type=float, nargs="+", default=[0.1, 0.05], help="cell sizes of the beam, m; 0.3 / h must be an integer"
     )
     parser.add_argument("--cells", type=int, default=20, help="cells over the bar")
     parser.add_argument("--periods", type=int, default=25, help="that the bar flies")
-    parser.add_argument("--steps", type=int, default=40, help="steps a period of the bar")
+    parser.add_argument("--steps", type=int, default=40, help="steps in a period of the bar")
     o = parser.parse_args(argv)
     if min(o.cells, o.periods) < 1 or o.steps < 8 or any(abs(DEPTH / h % 1 - 0.5) < 0.49 or h > 0.1 for h in o.h):
         options = f"--h {o.h} --cells {o.cells} --periods {o.periods} --steps {o.steps}"

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Water tables in unsaturated soil: one rises under rain (Vauclin), the other is in a levee during a flood.
+"""Water tables in unsaturated soil: a rise under rain (Vauclin), and a levee during a flood.
 
-A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of it is computed.  Rain
-falls on its middle metre for eight hours.  Water spreads above the table, through unsaturated soil.  The reference is
-a converged solution of finite volumes, with cells of 1.25 cm.  Source: Vauclin, Khanji and Vachaud (1979), with their
-laws. Soil above the level of the ditch is a seepage face without outflow.
+A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of the slab is computed. Rain
+falls on the middle metre for eight hours.  Above the water table, water spreads through unsaturated soil.  The
+reference is a converged solution of finite volumes, with cells of 1.25 cm.  Source: Vauclin, Khanji and Vachaud (1979),
+with their laws.  The side above the water level of the ditch is a seepage face, but no water seeps out.
 
-The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  A flood rises by 2.5 m in two days, stays
-for two days and falls in two days.  The soil of the levee retains water under suction, so water that infiltrates late
-also drains late.
+The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  The flood level rises by 2.5 m in two
+days, is constant for two days and falls in two days.  The soil of the levee retains water under suction, so water that
+infiltrates late also drains late.
 
-Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours, and the error
-of the final outflow into the ditch.  `balance`: error of the water balance of the slab, over the rain.  On one process.
+Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours.  A further
+error is that of the final outflow into the ditch.  `balance`: error of the water balance of the slab, divided by the
+rain.  On one process.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ CONVERGED = {
 }
 """By hour: heights of the water table at the positions, m."""
 FLOW = 653.1e-4 / HOUR  # m²/s into the ditch after 8 hours
-LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, run over rise, m
+LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, slope: run divided by rise, m
 SEEN = (2.0, 4.0, 6.0, 8.0)  # days
 
 
@@ -92,7 +93,7 @@ def level(t: float) -> float:
 
 
 def levee(h: float) -> mpm.Simulation:
-    """Return the levee on cells of size h, m, with water at rest and the water table at its base."""
+    """Return the levee on cells of size h, m, with hydrostatic water and the water table at its base."""
     base = CREST + 2 * SLOPE * LEVEE
     grid = mpm.Grid([0, 0], [base, LEVEE + 2 * h], [round(base / h), round(LEVEE / h) + 2])
     corners = [(0, 0), (base, 0), (base - SLOPE * LEVEE, LEVEE), (SLOPE * LEVEE, LEVEE)]
@@ -114,8 +115,8 @@ def levee(h: float) -> mpm.Simulation:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; that of the levee is 2.5 h")
-    parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; those of the levee: 9 times")
+    parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; cell size of the levee: 2.5 h")
+    parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; that of the levee: 9 times")
     o = parser.parse_args(argv)
     if not 0.025 <= o.h <= 0.25:
         parser.error(f"--h {o.h:g}: must be in [0.025, 0.25] m")
@@ -146,7 +147,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, frames: list) -> None:
-    """Draw the water tables of the slab, with the converged ones, and pressures in the levee."""
+    """Draw computed and converged water tables of the slab, and pressures in the levee."""
     fig, axes = common.figure(1 + len(frames), 1, (8, 10))
     first, *others = np.ravel(axes)
     for i, (hours, x, z) in enumerate(curves):

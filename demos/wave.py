@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load acts on a dry column, 10 m high, on a rigid base, which reflects the wave, or on an absorbing base.
-   The stress on the base is zero until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing one q.
-   Behind the front particles move by q / (rho c).  Stresses oscillate behind a front, so their means are compared.
+1. A sudden load q acts on a dry column, 10 m high, on a rigid base, which reflects the wave, or on an absorbing base.
+   The stress on the base is zero until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing base q.
+   Behind the front particles have the velocity q / (rho c).  Stresses oscillate behind a front, so their means are
+   compared.
 2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), slow or
    fast.  Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
-   water drains from 0.3 m below the top, little more than a cell, and its settlement is not compared.
-3. The same column under a sudden load, with incompressible water and grains, k = 0.01 m/s, before a wave returns from
-   its base (after de Boer, Ehlers and Liu 1993).  Its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2 a)
-   ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
+   only the top 0.3 m drains, little more than a cell.  The settlement is therefore not compared.
+3. A sudden load acts on the same column, with incompressible water and grains, and k = 0.01 m/s.  Results are compared
+   until a wave returns from the base (after de Boer, Ehlers and Liu 1993).  The settlement is q / (M a^(1/2)) int
+   exp(-b s / 2 a) I0(b s / 2 a) ds, with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
 
 The equations are the u-p form: water accelerates with the grains.
 """
@@ -39,7 +40,7 @@ BOUNDS = {"stress": 0.02, "velocity": 0.02, "u": 0.01, "p": 0.006, "settlement":
 
 
 def column(cells: int, conditions: list, soil: mpm.Skeleton, length: float = LENGTH, **options) -> mpm.Simulation:
-    """Return a column, one cell wide, with a cell of the grid below its base."""
+    """Return a column, one cell wide, with one empty cell of the grid below its base."""
     h = length / cells
     grid = mpm.Grid([0, 0], [h, length + 3 * h], [1, cells + 3])
     body = mpm.box(grid, [0, h], [h, length + h])
@@ -47,9 +48,10 @@ def column(cells: int, conditions: list, soil: mpm.Skeleton, length: float = LEN
 
 
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
-    """Return t, over L / c, stress on the base and velocity of the top, over exact values, under a sudden load.
+    """Return t divided by L / c, and stress on the base and velocity of the top, divided by their exact values.
 
-    On a rigid base the stress is computed from the reaction, on an absorbing one from the velocity.
+    The load is sudden.  On a rigid base the stress is computed from the reaction, on an absorbing base from the
+    velocity.
     """
     soil, h = SOIL(grain_density=GRAINS), LENGTH / cells
     c = np.sqrt(MODULUS / ((1 - POROSITY) * GRAINS))
@@ -107,7 +109,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
-    """Return times, s, settlements of the top, m, and exact ones, of a saturated column under a sudden load."""
+    """Return times, s, settlements of the top, m, and exact settlements of a saturated column under a sudden load."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,
@@ -126,8 +128,8 @@ def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
-    parser.add_argument("--cells", type=int, default=40, help="cells over the columns")
-    parser.add_argument("--steps", type=int, default=50, help="steps a period of the load that swings")
+    parser.add_argument("--cells", type=int, default=40, help="cells over the height of the columns")
+    parser.add_argument("--steps", type=int, default=50, help="steps in a period of the harmonic load")
     parser.add_argument("--periods", type=int, default=6, help="that it swings")
     o = parser.parse_args(argv)
     if min(o.cells, o.steps) < 8 or o.periods < 2:
@@ -166,7 +168,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, dry: dict, swings: dict, loaded: dict[str, np.ndarray]) -> None:
-    """Draw stresses at the base, amplitudes of pressure over the depth, and settlements, with exact ones."""
+    """Draw stresses at the base, pressure amplitudes over the depth, and settlements, with exact values."""
     fig, ((base, depth, top),) = common.figure(1, 3, (14, 4.4))
     steps = {"rigid": [0, 0, 2, 2, 0, 0], "quiet": [0, 0, 1, 1, 1, 1]}
     for k, (name, run) in enumerate(dry.items()):

@@ -5,10 +5,10 @@ A number is *structure* where it cannot be another one: see `structure` below. I
 or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    Sensitivity (name scene): half the value changes the result by a, twice by b, finer cells by c.
+    Halving this value changes the result of scene `name` in tests/plateaus.py by a (relative), doubling it by b, and
+    finer cells by c.
 
-The latter are relative changes of the scene's results: with half and twice the number, and with finer cells. One of the
-first two is not zero, so the number affects the scene; both are below the third. `python tests/plateaus.py` measures
+One of a and b is not zero, so the number affects the scene; both are below c. `python tests/plateaus.py` measures
 them again. All other numbers are *ad hoc*.
 """
 
@@ -25,8 +25,8 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(
-    r"\bSensitivity \((\w+) scene\): half the value changes the result by ([\d.e+-]+), "
-    r"twice by ([\d.e+-]+), finer cells by ([\d.e+-]*[\d])"
+    r"\bHalving this value changes the result of scene `(\w+)` in tests/plateaus.py by ([\d.e+-]+) \(relative\), "
+    r"doubling it by ([\d.e+-]+), and finer cells by ([\d.e+-]*[\d])"
 )
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""

@@ -148,8 +148,9 @@ def main(arguments: list[str]) -> None:
         began = time.time()
         found = moved(where, name, scene)
         half, twice, cells = (f"{value:.1e}" for value in found)
-        told = f"half the value changes the result by {half}, twice by {twice}, finer cells by {cells}."
-        print(f"{number} Sensitivity ({scene} scene): {told}  {time.time() - began:.0f} s", flush=True)
+        where = f"Halving this value changes the result of scene `{scene}` in tests/plateaus.py"
+        told = f"{where} by {half} (relative), doubling it by {twice}, and finer cells by {cells}."
+        print(f"{number} {told}  {time.time() - began:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ CEILINGS = {
     "lines of the package": 37350,
 }
 
-HALF = "half the value changes the result by"
+HALF = "Halving this value changes the result of scene `bank` in tests/plateaus.py by"
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def test_every_measure_has_a_ceiling(measures):
         ("Half of a cell.", False),
         ("Source: it works well", False),
         ("Source: Higham (2002), eq. 3.4.", True),
-        (f"Sensitivity (bank scene): {HALF} 1e-5, twice by 2e-5, finer cells by 3e-3.", True),
-        (f"Sensitivity (bank scene): {HALF} 1e-5, twice by 4e-3, finer cells by 3e-3.", False),
+        (f"{HALF} 1e-5 (relative), doubling it by 2e-5, and finer cells by 3e-3.", True),
+        (f"{HALF} 1e-5 (relative), doubling it by 4e-3, and finer cells by 3e-3.", False),
     ],
 )
 def test_number_has_a_source_or_moves_less_than_the_cells(said, holds):

@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 from types import ModuleType
 
+from plateaus import SCENES
+
 import mpm_dolfinx
 
 ROOT = Path(mpm_dolfinx.__file__).parent
@@ -15,7 +17,7 @@ TEXTS = {file: file.read_text() for file in FILES}
 TREES = {file: ast.parse(text) for file, text in TEXTS.items()}
 NAME = re.compile(r"`([A-Za-z_][\w.]*)`")
 WRITTEN = {".txt", ".pvd", ".csv", ".xdmf", ".h5", ".vtu", ".py"}  # files
-ELSEWHERE = {"_repr_html_", "write_data"}  # names of libraries, of notebooks and meshio
+ELSEWHERE = {"_repr_html_", "write_data", *SCENES}  # names of notebooks, of meshio, and of scenes of plateaus.py
 OBJECTS = {"points"}  # which users are given
 
 

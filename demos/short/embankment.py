@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""An embankment is built on soft clay, which then consolidates: settlement under its middle."""
+"""An embankment is built on soft clay, and the clay consolidates: settlement below the middle of the embankment."""
 
 import mpm_dolfinx as mpm
 
 YEAR = 3.156e7  # s
-grid = mpm.Grid(lower=[0, -3], upper=[20, 3], cells=[40, 12])  # m: half of it, by symmetry
+grid = mpm.Grid(lower=[0, -3], upper=[20, 3], cells=[40, 12])  # m: half of the ground, by symmetry
 clay = mpm.box(grid, [0, -3], [20, 0])
 bank = mpm.polygon(grid, [(0, 0), (12, 0), (8, 2), (0, 2)], ["base", "slope", "crest", "axis"], material=1, size=0.3)
 soils = [
@@ -24,7 +24,7 @@ simulation = mpm.Simulation(
     later=[1],
 )
 simulation.run(t_end=1, dt=1)  # the clay at rest
-seepage = [mpm.Drained(side, seepage=True) for side in ("slope", "crest")]  # water leaves here, none enters
+seepage = [mpm.Drained(side, seepage=True) for side in ("slope", "crest")]  # water may leave here, but not enter
 simulation.stage(add=[1], conditions=[*simulation.conditions, *seepage])
 middle = mpm.probes([clay, bank], [[0, 0]])
 result = simulation.run(t_end=5 * YEAR, rtol=1e-2, t_eval=[0.1 * YEAR, YEAR], probes=middle)

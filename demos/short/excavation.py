@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Excavation below the water table: three lifts are dug, the pit is kept dry, and water seeps to its bottom."""
+"""Excavation below the water table: three lifts are dug, and water that seeps into the pit is pumped out."""
 
 import mpm_dolfinx as mpm
 
 DAY = 86400.0  # s
-grid = mpm.Grid(lower=[0, 0], upper=[20, 11], cells=[40, 22])  # m: half of the pit and its ground, by symmetry
+grid = mpm.Grid(lower=[0, 0], upper=[20, 11], cells=[40, 22])  # m: half of the pit and the ground, by symmetry
 lifts = [mpm.box(grid, [0, y], [6, y + 1]) for y in (9, 8, 7)]  # from the surface down
 ground = mpm.polygon(
     grid, [(0, 0), (20, 0), (20, 10), (6, 10), (6, 7), (0, 7)], ["base", "far", "crest", "wall", "pit", ""]

@@ -3,7 +3,7 @@
 
 import mpm_dolfinx as mpm
 
-WIDTH, STRENGTH = 1.8, 20e3  # m, Pa: an odd number of cells over the width
+WIDTH, STRENGTH = 1.8, 20e3  # m, Pa; with an odd number of cells over the width
 grid = mpm.Grid(lower=[0, -2.4], upper=[4, 0.4], cells=[20, 14])
 ground = mpm.box(grid, [0, -2.4], [4, 0])
 clay = mpm.MohrCoulomb(bulk=1e10, shear=1e9, friction=0, dilation=0, cohesion=STRENGTH)

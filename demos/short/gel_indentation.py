@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Indentation of a wet gel by a rigid sphere: the force relaxes as the gel drains, and tells Poisson's ratio."""
+"""Indentation of a saturated gel by a rigid sphere: the force relaxes as the gel drains, and yields Poisson's ratio."""
 
 import mpm_dolfinx as mpm
 

@@ -12,7 +12,7 @@ clay = mpm.MohrCoulomb(
     shear=6e6,
     friction=0,
     dilation=0,
-    cohesion=lambda X: np.full(len(X), 40e3),  # Pa: a field, so that a stage may change it
+    cohesion=lambda X: np.full(len(X), 40e3),  # Pa: a function of position, so that a stage can change the cohesion
     grain_density=2650,
     porosity=0.4,
 )

@@ -17,7 +17,7 @@ outside = shape.addCircleArc(ends[1], centre, ends[2])
 edges = [inside, shape.addLine(ends[0], ends[1]), outside, shape.addLine(ends[2], ends[3])]
 pipe = shape.addPlaneSurface([shape.addCurveLoop(edges)])
 shape.synchronize()
-gmsh.model.setPhysicalName(1, gmsh.model.addPhysicalGroup(1, [inside]), "inside")  # names become names of sides
+gmsh.model.setPhysicalName(1, gmsh.model.addPhysicalGroup(1, [inside]), "inside")  # these names become names of sides
 gmsh.model.addPhysicalGroup(2, [pipe])
 gmsh.model.mesh.generate(2)
 gmsh.write("pipe.msh")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body from triangles of any program, by meshio: a wedge of earth under its weight."""
+"""A body from a triangle mesh of any program, read by meshio: a wedge of earth under its weight."""
 
 import meshio
 import numpy as np
@@ -11,7 +11,7 @@ rows = [[(x, y) for x in np.linspace(0, 4 - y / 2, n + 1)] for y in np.linspace(
 corner = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
 a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
 triangles = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
-mesh = meshio.Mesh(np.concatenate(rows), [("triangle", triangles)])  # or meshio.read("a_file"), or the file's name
+mesh = meshio.Mesh(np.concatenate(rows), [("triangle", triangles)])  # or meshio.read("a_file"), or the name of a file
 
 grid = mpm.Grid(lower=[0, 0], upper=[5, 5], cells=[15, 15])  # m
 wedge = mpm.from_mesh(grid, mesh)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A law of your own in UFL: a tissue that stiffens exponentially is compressed by a tenth."""
+"""Your own law in UFL: a tissue that stiffens exponentially is compressed by a tenth."""
 
 from dataclasses import dataclass
 

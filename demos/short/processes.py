@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""One script, on one process or several: `mpirun -n 2 python processes.py`."""
+"""The same script on one process or on several: `mpirun -n 2 python processes.py`."""
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid(lower=[0, 0], upper=[8, 2.5], cells=[32, 10])  # m: its cells are shared among the processes
+grid = mpm.Grid(lower=[0, 0], upper=[8, 2.5], cells=[32, 10])  # m: the cells are distributed among the processes
 ground = mpm.box(grid, [0, 0], [8, 2])
 clay = mpm.Hencky(bulk=2e6, shear=1e6, porosity=0.5, conductivity=1e-9)
 load = mpm.Traction("top", (0, -2e4), region=((0, 0), (2, 3)))
@@ -17,7 +17,7 @@ simulation = mpm.Simulation(
 )
 middle = mpm.probes([ground], [[0, 2]])
 result = simulation.run(t_end=1e5, dt=2e4, probes=middle)  # histories are the same on all processes
-axes = mpm.plot(simulation, "displacement_y")  # all processes take part, the first one draws
+axes = mpm.plot(simulation, "displacement_y")  # all processes must call this; the first process draws
 if grid.comm.rank == 0:
     axes.figure.savefig("processes.png", bbox_inches="tight")
     print(f"settlement: {-1000 * result.displacement[-1, 0, 1]:.6f} mm")

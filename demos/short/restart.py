@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An interrupted run continues from its checkpoint, with the result of an uninterrupted one."""
+"""An interrupted run continues from its checkpoint, with the result of an uninterrupted run."""
 
 import mpm_dolfinx as mpm
 

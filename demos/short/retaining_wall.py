@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A smooth retaining wall of 3 m tilts about its toe, away from the sand: the thrust falls to the active one."""
+"""A smooth retaining wall of 3 m tilts about its toe, away from the sand: the thrust falls to the active thrust."""
 
 import mpm_dolfinx as mpm
 

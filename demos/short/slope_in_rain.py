@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rain on a slope: it soaks in, the suction fades, and the factor of safety falls."""
+"""Rain on a slope: water infiltrates, suction decreases, and the factor of safety decreases."""
 
 import mpm_dolfinx as mpm
 
@@ -19,7 +19,7 @@ silt = mpm.MohrCoulomb(
     conductivity=5e-6,
     retention=mpm.VanGenuchten(entry=1e4, n=2.0),
 )
-rain = [mpm.Rain(side, lambda t: 4e-6 * (t > 0)) for side in ("slope", "crest", "foot")]  # m/s
+rain = [mpm.Rain(side, 4e-6) for side in ("slope", "crest", "foot")]  # m/s, per area of each side
 simulation = mpm.Simulation(
     grid,
     [bank],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Factor of safety of a slope by strength reduction: 10 m high, 2:1, 7.8 kPa, 20 degrees."""
+"""Factor of safety by strength reduction, for a slope of 2:1, 10 m high, c = 7.8 kPa, phi = 20 degrees."""
 
 import mpm_dolfinx as mpm
 

@@ -8,7 +8,7 @@ clay = mpm.ModifiedCamClay(
     lambda_=0.1,
     kappa=0.02,
     shear=5e6,
-    initial_stress=(-1e5, -1e5, -1e5),  # Pa: consolidated under 100 kPa
+    initial_stress=(-1e5, -1e5, -1e5),  # Pa: the clay is consolidated under 100 kPa
     OCR=1.5,
 )
 test = mpm.element_test(clay, "triaxial undrained", strain=0.3)

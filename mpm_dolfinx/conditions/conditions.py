@@ -394,17 +394,18 @@ The displacement error is (change of traction in the step, except by rotation) /
 does not accumulate, because each step measures it from the prescribed position.  Where a body is much stiffer than the
 penalty, multipliers remove the error, see `HoldLoads.augment`.
 
-Sensitivity (soil scene): half the value changes the result by 5.9e-05, twice by 2.0e-05, finer cells by 3.0e-02.
+Halving this value changes the result of scene `soil` in tests/plateaus.py by 5.9e-05 (relative), doubling it by
+2.0e-05, and finer cells by 3.0e-02.
 """
 WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).
-
-Sensitivity (soil scene): half the value changes the result by 5.0e-06, twice by 7.9e-06, finer cells by 3.0e-02.
+"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).  Halving
+this value changes the result of scene `soil` in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
+finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of laws with a state, because yielding soil is much softer.
-
-Sensitivity (soil scene): half the value changes the result by 6.5e-05, twice by 1.9e-05, finer cells by 3.0e-02.
+"""Factor on the elastic modulus in the penalty of laws with a state, because yielding soil is much softer.  Halving
+this value changes the result of scene `soil` in tests/plateaus.py by 6.5e-05 (relative), doubling it by 1.9e-05, and
+finer cells by 3.0e-02.
 """
 
 

@@ -28,9 +28,8 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap, in cells, between faces of two domains that still count as one surface.
-
-Sensitivity (flow scene): half the value changes the result by 2.5e-05, twice by 0.0e+00, finer cells by 9.0e-02.
+"""Largest gap, in cells, between faces of two domains that still count as one surface.  Halving this value changes the
+result of scene `flow` in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
 """
 CRUMB = NEAR
 """Area, as a fraction of the cell, below which a part is dropped; other parts receive its mass.  Source: as `NEAR`."""

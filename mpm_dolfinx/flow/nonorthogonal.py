@@ -31,14 +31,13 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 ALONG = 1e-4
 """Offset of two centroids along a face, in cells, up to which they need no correction."""
 NEAREST = 0.1
-"""Lower bound, in cells, of the distances in the weights of the least-squares fit.
-
-Sensitivity (slope scene): half the value changes the result by 3.0e-08, twice by 1.2e-06, finer cells by 3.4e-03.
+"""Lower bound, in cells, of the distances in the weights of the least-squares fit.  Halving this value changes the
+result of scene `slope` in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and finer cells by 3.4e-03.
 """
 SIDES = 2.0
-"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.
-
-Sensitivity (slope scene): half the value changes the result by 4.8e-06, twice by 2.8e-06, finer cells by 3.4e-03.
+"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Halving
+this value changes the result of scene `slope` in tests/plateaus.py by 4.8e-06 (relative), doubling it by 2.8e-06, and
+finer cells by 3.4e-03.
 """
 
 

@@ -31,16 +31,15 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty.
-
-Sensitivity (beam scene): half the value changes the result by 9.9e-06, twice by 1.9e-05, finer cells by 1.5e-02.
+"""Strength of the ghost penalty.  Halving this value changes the result of scene `beam` in tests/plateaus.py by 9.9e-06
+(relative), doubling it by 1.9e-05, and finer cells by 1.5e-02.
 """
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""Ratio of the volume fractions of two neighbouring cells below which their common face is penalised.
-
-Sensitivity (soil scene): half the value changes the result by 1.3e-03, twice by 5.9e-04, finer cells by 3.0e-02.
+"""Ratio of the volume fractions of two neighbouring cells below which their common face is penalised.  Halving this
+value changes the result of scene `soil` in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer
+cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
 """Strength of the penalty with integration at the points; volume fraction below which faces of a cell have it."""

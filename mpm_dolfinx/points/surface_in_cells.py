@@ -11,9 +11,8 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
-"""Number of surface edges in a cell with renewed particle domains.
-
-Sensitivity (flow scene): half the value changes the result by 1.6e-03, twice by 1.5e-03, finer cells by 9.0e-02.
+"""Number of surface edges in a cell with renewed particle domains.  Halving this value changes the result of scene
+`flow` in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
 """Deviation of the surface from a chord, in cells, above which it has a corner; flatter parts are divided evenly.

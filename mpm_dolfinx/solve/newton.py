@@ -44,14 +44,12 @@ INNER = 1e-3  # momentum tolerance / storage error: unconverged rotations cause 
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations with changing contacts / largest number without
 LOOSEST = 1e-2
-"""Largest residual after a linear solve / residual before the solve.
-
-Sensitivity (soil scene): half the value changes the result by 2.2e-11, twice by 6.0e-12, finer cells by 3.0e-02.
+"""Largest residual after a linear solve / residual before the solve.  Halving this value changes the result of scene
+`soil` in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve / tolerance.
-
-Sensitivity (soil scene): half the value changes the result by 4.0e-12, twice by 3.1e-11, finer cells by 3.0e-02.
+"""Residual after the last linear solve / tolerance.  Halving this value changes the result of scene `soil` in
+tests/plateaus.py by 4.0e-12 (relative), doubling it by 3.1e-11, and finer cells by 3.0e-02.
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end: above it the contact area still changes
 ERROR = 1 / 20

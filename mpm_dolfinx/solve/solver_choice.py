@@ -54,21 +54,19 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Tightest relative tolerance of a linear solve.
-
-Sensitivity (soil scene): half the value changes the result by 4.0e-11, twice by 1.2e-11, finer cells by 3.0e-02.
+"""Tightest relative tolerance of a linear solve.  Halving this value changes the result of scene `soil` in
+tests/plateaus.py by 4.0e-11 (relative), doubling it by 1.2e-11, and finer cells by 3.0e-02.
 """
 FORCING_3D = 1e-3
 """Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
-"""Largest ratio of successive residuals for which the next Newton step reuses the tangent.
-
-Sensitivity (soil scene): half the value changes the result by 4.9e-11, twice by 1.0e-11, finer cells by 3.0e-02.
+"""Largest ratio of successive residuals for which the next Newton step reuses the tangent.  Halving this value changes
+the result of scene `soil` in tests/plateaus.py by 4.9e-11 (relative), doubling it by 1.0e-11, and finer cells by
+3.0e-02.
 """
 KEEP_WET = 0.01
-"""As `KEEP`, in wet 2D scenes without yield.
-
-Sensitivity (beam scene): half the value changes the result by 1.8e-11, twice by 2.9e-10, finer cells by 1.5e-02.
+"""As `KEEP`, in wet 2D scenes without yield.  Halving this value changes the result of scene `beam` in
+tests/plateaus.py by 1.8e-11 (relative), doubling it by 2.9e-10, and finer cells by 1.5e-02.
 """
 
 

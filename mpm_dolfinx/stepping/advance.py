@@ -54,7 +54,8 @@ pressures of a manufactured solution converge with an order below 1.75. Without 
 order in time is unaffected. The mean defect of drained parts is not corrected: with a correction, a column under
 varying gravity has order 1.2 in the step.
 
-Sensitivity (beam scene): half the value changes the result by 1.7e-03, twice by 2.8e-03, finer cells by 1.5e-02.
+Halving this value changes the result of scene `beam` in tests/plateaus.py by 1.7e-03 (relative), doubling it by
+2.8e-03, and finer cells by 1.5e-02.
 """
 
 
