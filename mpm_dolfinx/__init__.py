@@ -3,11 +3,11 @@
 
 A `Simulation` contains a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), and materials: `Hencky`,
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`,
-`BarcelonaBasic`, or a user-defined `Skeleton`.  It has a `Fluid`, and conditions on the sides of the bodies:
-`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`.  A rigid `Tool` has the shape
-`HalfSpace`, `Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  A `Writer` writes results
-to files, which `one_file` joins; `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two
-runs.  `factor_of_safety` reduces the strength until failure.  Terms in UFL: `mpm_dolfinx.materials.user_functions`.
+`BarcelonaBasic`, or your own `Skeleton`.  It has a `Fluid`, and conditions on the sides of the bodies: `Traction`,
+`Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`.  A rigid `Tool` has the shape `HalfSpace`,
+`Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  A `Writer` writes results to files,
+which `one_file` joins; `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two runs.
+`factor_of_safety` reduces the strength until failure.  For terms in UFL see `mpm_dolfinx.materials.user_functions`.
 
 Units are SI, or any consistent ones (`Fluid`).  Stress is positive in tension, pore pressure in compression.  In plane
 strain, forces act on a slice of 1 m.  In axisymmetry (`Grid`), forces act on the full circumference.

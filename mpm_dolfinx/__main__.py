@@ -56,7 +56,7 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return a law: of the package by its name, or of a user by file.py:name."""
+    """Return a law of the package by its name, or a user-defined law by file.py:name."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)

@@ -5,7 +5,7 @@ A number is *structure* where it cannot be another one: see `structure` below. I
 or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    Halving this value changes the result of scene `name` in tests/plateaus.py by a (relative), doubling it by b, and
+    Halving this value changes the result of scene "name" in tests/plateaus.py by a (relative), doubling it by b, and
     finer cells by c.
 
 One of a and b is not zero, so the number affects the scene; both are below c. `python tests/plateaus.py` measures
@@ -25,7 +25,7 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(
-    r"\bHalving this value changes the result of scene `(\w+)` in tests/plateaus.py by ([\d.e+-]+) \(relative\), "
+    r'\bHalving this value changes the result of scene "(\w+)" in tests/plateaus.py by ([\d.e+-]+) \(relative\), '
     r"doubling it by ([\d.e+-]+), and finer cells by ([\d.e+-]*[\d])"
 )
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}

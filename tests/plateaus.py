@@ -148,7 +148,7 @@ def main(arguments: list[str]) -> None:
         began = time.time()
         found = moved(where, name, scene)
         half, twice, cells = (f"{value:.1e}" for value in found)
-        where = f"Halving this value changes the result of scene `{scene}` in tests/plateaus.py"
+        where = f'Halving this value changes the result of scene "{scene}" in tests/plateaus.py'
         told = f"{where} by {half} (relative), doubling it by {twice}, and finer cells by {cells}."
         print(f"{number} {told}  {time.time() - began:.0f} s", flush=True)
 

@@ -18,7 +18,7 @@ CEILINGS = {
     "lines of the package": 37350,
 }
 
-HALF = "Halving this value changes the result of scene `bank` in tests/plateaus.py by"
+HALF = 'Halving this value changes the result of scene "bank" in tests/plateaus.py by'
 
 
 @pytest.fixture(scope="module")

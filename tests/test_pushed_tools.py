@@ -238,7 +238,7 @@ def test_a_load_pushes_along_the_axis_and_in_space():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"load": 1.0}, "load and direction, must be given together"),
+        ({"load": 1.0}, "load = 1.0 and direction = None, must be given together"),
         ({"load": np.nan, "direction": (0, -1)}, "load at t = 0 s = nan, must be"),
         ({"load": "1 kN", "direction": (0, -1)}, "load at t = 0 s = '1 kN', must be"),
         ({"load": lambda t: -1.0, "direction": (0, -1)}, "load at t = .* = -1, must be >= 0"),

@@ -60,7 +60,7 @@ def box_mesh(
         return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
     domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
     lists = graph.adjacencylist(*where)
-    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap a partitioner's
+    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap those of a partitioner
     return mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=lambda *_: lists)
 
 
@@ -228,7 +228,7 @@ class CompiledForm:
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix to `A`, with unrolled dofs, without final assembly.  `rows` replace dolfinx's coefficients."""
+        """Add the matrix, in unrolled dofs, to `A` without final assembly.  `rows` replace dolfinx's coefficients."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)

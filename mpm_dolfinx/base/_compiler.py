@@ -43,9 +43,9 @@ logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run.  Keys: the cache folders without write permission."""
+"""Temporary folders of this run, each by the cache folder that it replaces, because that folder is not writable."""
 _warnings: dict[Path, str] = {}
-"""Warnings not yet given.  Keys: temporary folders; the first compilation there gives the warning."""
+"""Warnings not yet given, by temporary folder.  The first compilation in a folder gives its warning."""
 
 
 @contextmanager
@@ -97,7 +97,7 @@ def _folder() -> Path:
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
-    """Return a new folder for libraries, which is removed at the end of the run."""
+    """Return a new folder for libraries that exists until the end of the run."""
     allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
     what = f"{cache}: {why.strerror}: cache folder of dolfinx's compiled forms"
     try:

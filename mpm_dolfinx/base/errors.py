@@ -27,8 +27,8 @@ class Report:
     first: float = 0.0  # largest pressure change in the first substep, Pa
     sudden: float = 0.0  # `first` if pressures change little more in the second substep, else 0
     stress: float = 0.0  # root mean square of the nodal forces, divided by the area of a cell face, Pa
-    moves: tuple[float, float] = (0.0, 0.0)  # estimated error of the motion, and the motion
-    fills: tuple[float, float] = (0.0, 0.0)  # estimated error and largest change of the water content, unsaturated soil
+    moves: tuple[float, float] = (0.0, 0.0)  # estimated error and size of the motion, see `motion_error`
+    fills: tuple[float, float] = (0.0, 0.0)  # in unsaturated soil: estimated error and largest change of water content
 
 
 class StepFailed(RuntimeError):

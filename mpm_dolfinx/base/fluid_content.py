@@ -72,7 +72,7 @@ def density_between(p0, p1, compliance):
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the mean of `density_between` for arrays of pressures (n,), Pa.  `bulk` is K_w, Pa."""
+    """Return the mean densities (n,) of `density_between` for arrays of pressures (n,), Pa.  `bulk` is K_w, Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

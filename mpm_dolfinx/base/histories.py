@@ -25,7 +25,7 @@ class Row(NamedTuple):
     pressure: NDArray[np.float64] = _none(0)  # minimum and maximum pore pressure of the points (2,), Pa
     position: NDArray[np.float64] = _none(0, 0)  # of the probes (m, d), m
     probe_pressure: NDArray[np.float64] = _none(0)  # pore pressure at the probes (m,), Pa, see `probe_fields`
-    probe_stress: NDArray[np.float64] = _none(0, 3, 3)  # effective stress there, tension positive (m, 3, 3), Pa
+    probe_stress: NDArray[np.float64] = _none(0, 3, 3)  # effective stress at the probes, tension positive (m, 3, 3), Pa
     outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = {}  # reactions, outflows and the like, see `State`
 
 
@@ -57,7 +57,7 @@ class _Columns:
 class Rows(Sequence[Row]):
     """Immutable sequence of the quantities at all output times of a run, a `Row` each.
 
-    An extended object shares its arrays with the previous one, so appending a row takes the same time in long runs.
+    An extended object shares its arrays with the previous one, so the time to append a row does not grow with the run.
     Rows of different length, as in stages with different conditions, are padded with nan.
 
     Attributes
@@ -76,7 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from columns (name -> values (n, ...)) and outcomes (n,); raise ValueError if they do not fit."""
+        """Return rows from columns (name -> values (n, ...)) and outcomes (n,); raise ValueError if lengths differ."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:

@@ -9,8 +9,8 @@ zeta' + Q(u, p) = 0 with the net outflow Q.  With the subscript n at the start o
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
 With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method needs no rate at
-the start of the step; there the transfer between grids would make rates noisy. (u2, p2) is the end of the step.  After
-a jump of the loads, one long step overshoots by a fifth, two steps of half the length do not: see `step_size`.  The
+the start of the step, which the transfer between grids would make noisy.  (u2, p2) is the end of the step.  After a
+jump of the loads, one long step overshoots by a fifth, but two steps of half the length do not, see `step_size`.  The
 error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
@@ -45,8 +45,8 @@ def in_step(
     """Return the displacement in the first substep that gives a prescribed motion its exact velocity.
 
     With share = gamma, the method implies u = share dt v in the first substep; both substeps give the velocity at the
-    end.  If u is prescribed in both substeps, velocities are first-order accurate and accelerations do not converge.
-    Here v is the velocity of the parabola through the three displacements.
+    end of the step.  If u is prescribed in both substeps, velocities are first-order accurate and accelerations do not
+    converge.  This function takes v from the parabola through the three displacements.
 
     `share` is the end of the substep as a fraction of the step.  The displacements are `start` at the
     start of the step, `now` at the end of the substep and `end` at the end of the step.

@@ -12,8 +12,9 @@ X : (m, d), m
 x : (m, d), m
     Positions of the same places at the start of the step, for example to prescribe a water level.
 
-A single parameter with another name is the time.  Other names raise an error.  Parameters with defaults keep them.
-Material constants are functions of X.  Initial pressures and stresses are functions of x, the seeded positions.
+If a function has only one parameter, and its name is not in this list, it receives the time.  With several parameters,
+other names raise an error.  Parameters with default values keep these.  Material constants are functions of X.  Initial
+pressures and stresses are functions of x, the seeded positions.
 
 A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
 or an array (m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.
@@ -266,7 +267,7 @@ def at_places(what: str, allowed: str, function: Callable, name: str, places: ND
 def given(
     what: str, value, t: float, side: Places | None = None, dim: int = 0, *, among: Sequence[str] = NAMES, number=True
 ) -> NDArray[np.float64]:
-    """Return a value at time t: () or (m,) for m places; if `dim` > 0 also (d,) or (m, d).
+    """Return a value at time t, of shape () or (m,) for m places; if `dim` > 0 also (d,) or (m, d).
 
     A function of position that returns one vector gives this vector at each place, (m, d).
 
@@ -288,7 +289,7 @@ def given(
     Raises
     ------
     ValueError
-        With the object, the value, and the allowed values.
+        The value is not allowed; the message gives the object, the value and the allowed values.
     """
     one = [*[()] * number, *[(dim,)] * bool(dim)]
     allowed = f"a finite number{f' or {dim} of them' if dim else ''}" if number else f"{dim} finite numbers"

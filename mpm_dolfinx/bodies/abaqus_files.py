@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of Abaqus (and CalculiX) input files: a meshio mesh with placed instances, sets and surfaces.
+"""Reader of Abaqus (and CalculiX) input files, which returns a meshio mesh with placed instances, sets and surfaces.
 
 meshio's reader keeps only the nodes of the last part, and ignores the placement of instances.
 """
@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Patterns of element types.  The group is the number of nodes, or for beams the order."""
+"""Pattern of the types of line elements.  The first group is the number of nodes, the second the order of a beam."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -45,7 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements.  Each entry is an instance, or "", with element numbers or the name of another set."""
+    """A set of elements.  Each entry has the name of an instance, or "", and element numbers or another set's name."""
 
     name: str
     internal: bool
@@ -100,7 +100,7 @@ def is_abaqus(file: Path) -> bool:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of an input file.  Parts are element sets and instances; sides are surfaces."""
+    """Return the mesh of an input file.  Element sets and instances become parts; surfaces become sides."""
     return _assembled(_placed(file))
 
 
@@ -138,7 +138,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside of parts, then of all instances, or of all parts if no instance exists."""
+    """Return the definitions outside of parts, followed by all instances, or by all parts if no instance exists."""
     whole = _Scope()
     scope = whole
     parts = {}
@@ -303,7 +303,7 @@ def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list
 def _members(
     placed: list[_Placed], k: int, key: str, above: tuple[str, ...] = ()
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return the element numbers of a set, each array with the index of its instance or part in `placed`."""
+    """Return arrays of the element numbers in a set, each with the index of its instance or part in `placed`."""
     out = []
     if key not in placed[k].scope.sets or key in above:
         known = ", ".join(found.name for found in placed[k].scope.sets.values()) or "none"

@@ -91,8 +91,8 @@ class Body:
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face numbers.
 
-        In unstructured bodies: surface faces whose outward unit normal has its largest component along this direction.
-        The component must exceed `least`.
+        In unstructured bodies, these are the surface faces whose outward unit normal has its largest component along
+        this direction, if this component exceeds `least`.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
@@ -130,7 +130,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the distances (m,), m, between edge midpoints of mapped domains and mapped midpoints of the boxes.
+        """Return the largest distances (m,), m, from edge midpoints of domains to mapped edge midpoints of their boxes.
 
         Straight edges of two domains along the same curve may differ by this distance.
         """
@@ -176,12 +176,12 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     body
         Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An earlier map is applied first.
     map
-        Function from positions (n, d), m, to positions (n, d), m, inside the grid.  Smooth; must preserve orientation.
+        Function from positions (n, d), m, to positions (n, d), m, in the grid; smooth, and preserving orientation.
 
     Raises
     ------
     ValueError
-        The map raises, returns another shape or nan, leads out of the grid, or inverts a box.
+        The map raises an exception, returns another shape or nan, leads out of the grid, or inverts a box.
     """
     instance("body: grid", grid, Grid)
     instance("body to bend", body, Body)
@@ -293,7 +293,7 @@ def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def check_different(bodies: Sequence[Body]) -> None:
-    """Raise an error for a repeated body: conditions would count its faces twice, but act on one copy only."""
+    """Raise an error for a repeated body, because conditions would count its faces twice, but act on one copy only."""
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:

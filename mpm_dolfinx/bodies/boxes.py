@@ -98,7 +98,7 @@ class LatticeBody(Body):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths; `spacing` (d,) are the narrowest rows, m."""
+    """A body of boxes on a lattice with rows of different widths; `spacing` (d,), m, is the width of the narrowest."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
 
@@ -173,7 +173,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.
+        lines.  If it is 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.
     material
         Index of the material in the scene's list, >= 0.
 
@@ -201,7 +201,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed a body with the domains of a lattice over the whole grid whose centres lie inside a shape; return the body.
+    """Seed a body from a lattice over the whole grid: all domains with centres inside a shape; return the body.
 
     The surface of the body has steps of the size of a domain.  `mapped` gives smooth sides.
 
@@ -219,7 +219,7 @@ def shape(
     Raises
     ------
     ValueError
-        `inside` raises, returns no booleans or is False everywhere; `per_cell` or `material` is invalid.
+        `inside` raises an exception, returns no booleans or is False everywhere; `per_cell` or `material` is invalid.
     """
     instance("body: grid", grid, Grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)

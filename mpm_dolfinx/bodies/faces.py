@@ -180,7 +180,7 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # else a sliver would prescribe a whole domain
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # a sliver in the region would prescribe a domain
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)
@@ -195,7 +195,7 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Limit parts of faces to a region; return their faces (m,), and their corners xi as in `Surface`.
+    """Limit parts of faces to a region; return the face (m,) of each limited part, and its corners xi as in `Surface`.
 
     `row` and `face` (k,) are domains and face numbers.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
     """
@@ -293,7 +293,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return local coordinates xi (n, 3) of domains (n, 8, 3) after a move along faces (n,) to positions x (n, 3)."""
+    """Return local coordinates xi (n, 3) in domains (n, 8, 3), moved along faces (n,) to match positions x (n, 3)."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

@@ -47,7 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill lie on the paired face, and its displacements there (n, 4, d), m."""
+        """Return which corners (n, 4) of the fill lie on the paired faces, and displacements (n, 4, d), m, of these."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
@@ -72,9 +72,9 @@ def put(
 ) -> MaterialPoints:
     """Return the material points of a fill, placed onto the active bodies.
 
-    Sides of the fill that touch a neighbour as seeded follow the neighbour's displacement.  The side opposite to the
-    largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero velocity;
-    its domains have the volumes of the displaced shape.
+    Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
+    the largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero
+    velocity; its domains have the volumes of the displaced shape.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements (n,) along an axis: u where fixed; the other nodes are in equilibrium with these."""
+    """Return the displacements (n,) along an axis: u at fixed nodes, at other nodes the equilibrium of springs K."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -223,7 +223,7 @@ def _penetration(
 ) -> tuple[float, float, NDArray[np.float64]]:
     """Return the penetration depth of a body into the fill's domains, m, the gap in cells, and the position (d,), m.
 
-    Depth or gap is zero.
+    Depth, gap or both are zero.
     """
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of gmsh files of format 4.1: a meshio mesh with all physical groups of each entity.
+"""Reader of gmsh files of format 4.1, which returns a meshio mesh with all physical groups of each entity.
 
 meshio's reader keeps only the first group of an entity, and fails for entities without a group.
 """

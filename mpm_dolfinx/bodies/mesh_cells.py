@@ -55,7 +55,7 @@ def edges(kind: str) -> list[tuple[int, int]]:
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index of each distinct row of an array (n, k), and the index of the distinct row (n,).
+    """Return the first index of each distinct row of an array (n, k), and for each row its index (n,) among these.
 
     Distinct rows are sorted.  `np.unique` compares rows as objects and takes five times as long.
     """
@@ -135,7 +135,7 @@ class Polytopes:
     def overlaps(
         self, i: NDArray[np.int64], j: NDArray[np.int64], slack: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return which pairs (m,) of cells i, j overlap, and the depth of the overlap of each, m.
+        """Return the indices (k,) of the pairs of cells i, j (m,) that overlap, and the depths (k,), m, of overlap.
 
         Two convex cells overlap if no plane separates them.  It is sufficient to try planes normal to the facet normals
         and, in 3D, to the cross products of edges.  An overlap shallower than `slack` (m,), m, is ignored.

@@ -49,9 +49,9 @@ def from_mesh(
     """Seed a body from a mesh whose cells become particle domains; return the body.
 
     Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
-    surfaces, or facet tags.  Bodies from several parts of a mesh share their inner faces.  These are no surface while
-    both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice, so the filter of
-    short waves does not act.
+    surfaces, or facet tags.  Bodies from several parts of a mesh share the faces between the parts, which are no
+    surface while both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice, so
+    the filter of short waves does not act.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def from_mesh(
         Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a number in data
         such as "MaterialIDs".
     cell_tags, facet_tags
-        Tags of a dolfinx mesh.  For a file: `cell_tags` is the name of the cell data that number parts and sides.
+        Tags of a dolfinx mesh.  For a file, `cell_tags` is the name of the cell data that number parts and sides.
     names
         Number of the tag for each name.  A tag without a name is named by its number, such as "3".
     per_cell

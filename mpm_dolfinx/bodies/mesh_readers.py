@@ -28,7 +28,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a Nastran file.  gmsh writes files without the header that meshio needs; it is added."""
+    """Return the mesh of a Nastran file.  Add the header that meshio needs, because files of gmsh lack it."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")

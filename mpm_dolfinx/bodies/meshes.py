@@ -188,7 +188,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Raise an error for repeated cells: their weight and stiffness would count twice."""
+    """Raise an error for repeated cells, because their weight and stiffness would count twice."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
@@ -303,7 +303,7 @@ def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[ND
 
 
 def _check_convex(domains: NDArray[np.float64], name: str) -> None:
-    """Raise an error for cells that are flat, inverted or not convex: at a corner, or in a simplex of the division."""
+    """Raise an error for cells that are flat, inverted or not convex, at a corner or in one of their simplices."""
     d, bits = domains.shape[2], corner_bits(domains.shape[2])
     size = np.ptp(domains, axis=1).prod(axis=1)
     ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
@@ -365,7 +365,7 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Raise an error for surface faces of one mesh that touch each other; they would be loaded and drained."""
+    """Raise an error for surface faces of one mesh that touch each other, because conditions would act on them."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Overburden: weight of the domains vertically above positions in the bodies.
 
-Vertical lines enter and leave domains through faces.  In 3D each face consists of triangles about its middle, as where
-the grid cuts domains.  Domains that share a face therefore leave no gap, and do not overlap.
+Vertical lines enter and leave domains through faces.  In 3D each face is divided into triangles about its middle, as in
+the cut of domains by the grid.  Domains that share a face therefore leave no gap, and do not overlap.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stress, Pa, and surface level, m, above positions x along vertical lines at (m, d-1)."""
+    """Return overburden stresses, Pa, and surface levels, m, above x, on vertical lines at `places` (m, d-1)."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -70,7 +70,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield indices (k,) of vertical lines that cross a face of their domain (m, 2^d, d), heights and signs (k,).
+    """Yield indices (k,) of vertical lines that cross a face of their domain (m, 2^d, d), with heights and signs (k,).
 
     `at` (m, d-1) are the positions of the lines.  A sign is 1 where the line leaves the domain upwards, else -1.
     """

@@ -125,7 +125,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
-    """Return whether a position x (2,) is inside a polygon: a ray from x crosses an odd number of edges."""
+    """Return whether a position x (2,) is inside a polygon, that is, a ray from x crosses an odd number of edges."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
     return bool((crosses & ((_cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)

@@ -98,7 +98,7 @@ _OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
 
 
 def face_index(dim: int) -> NDArray[np.int64]:
-    """Return the corners (2d, 4) of the faces of a domain.  In plane strain each occurs at both ends of axis 3."""
+    """Return the corners (2d, 4) of a domain's faces.  In plane strain each corner occurs at both ends of axis 3."""
     return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
 
 
@@ -163,7 +163,7 @@ def covers(own: Faces, other: Faces) -> Cover:
 
 
 def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return faces (n, 4, 3) as parallelograms: the last corner is moved."""
+    """Return faces (n, 4, 3), made parallelograms by moving the last corner."""
     return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
@@ -236,7 +236,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes [low, high], (2,) or (n, 2); return the parts, and the owner of each."""
+    """Clip triangles (3, 2, n) to boxes [low, high], (2,) or (n, 2); return the parts, and the face (owner) of each."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -246,7 +246,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide each quadrilateral (n, 4, 2) into two triangles; return the triangles (3, 2, 2n), and their owners."""
+    """Divide each quadrilateral (n, 4, 2) into two triangles; return these (3, 2, 2n), and the face (owner) of each."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -262,7 +262,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis; return parts below and above, each with owners."""
+    """Divide triangles (3, e, n) at a plane normal to an axis; return parts below and above, with their faces."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)

@@ -155,10 +155,10 @@ class Loads:
         return self
 
     def flown(self, at: At) -> Any:
-        """Return data of this converged substep that the next one needs, with inertia."""
+        """With inertia, return the data of this converged substep that the next substep needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers at u on this process, W: dissipation by slip, and further power not computed from `push`.
+        """Return two powers at u on this process, W: dissipation by slip, and any power that `push` does not show.
 
         `v` are nodal velocities, a local array, m/s.
         """
@@ -168,7 +168,7 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces.  The scale of residuals leaves these forces out."""
+        """Add the constant part of the penalty forces.  The scale of residuals does not include these forces."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
@@ -177,10 +177,10 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that are scaled together with the internal forces."""
+        """Add forces at u that count as internal forces, also in the scale of residuals."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the matrix of forces that are linear in u.  `walls`: add the rows of components fixed by walls."""
+        """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components fixed by walls."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
         """Return the power, W, of `pulls` and `penalty` at u on this process.  `v`: velocities, a local array, m/s."""
@@ -190,7 +190,7 @@ class Loads:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual of unknowns or fixed components.  The scale leaves them out."""
+        """Subtract forces at u from the residual of unknowns or fixed components.  Its scale does not include them."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
         """Return the inertia forces at u, N, or None.  They enter the residual and its scale."""
@@ -202,11 +202,11 @@ class Loads:
         """Return minus the derivative of the forces in `push`, without the part in `tangent`."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u, and return whether this changed.  `sticks`: points may return to stick."""
+        """Update which points slip at u, and return whether any changed.  `sticks`: points may return to stick."""
         return False
 
     def augment(self, at: At) -> bool:
-        """Update the multipliers in equilibrium, and return whether forces changed."""
+        """Once equilibrium is reached, update the multipliers; return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:
@@ -221,7 +221,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on them that are not reactions of walls."""
+        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on these that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -231,7 +231,7 @@ class Loads:
     def touching(self) -> tuple | None:
         """Return the initial constraints: cells (m,), cells of the other body (m,), positions and directions (m, d).
 
-        Cells of the other body are None if the body does not deform.
+        Cells of the other body are None if that body does not deform.
         """
 
     @property
@@ -240,7 +240,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` leave out this condition."""
+        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` are those without this condition."""
         return of_cells
 
     @property
@@ -261,7 +261,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d), m, after the step are near a contact and follow the Q1 field alone."""
+        """Return which corners (n, 2^d, d), m, after a step are near a contact, so they follow the Q1 field alone."""
         return False
 
     def outside(
@@ -277,9 +277,10 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of domains whose prescribed faces keep their tracked corners.
+        """Return new corners (m, 2^d, d), m, of re-initialised domains, which keep tracked corners on prescribed sides.
 
-        `ids` and `volume` (m,), m^d, are the points and volumes of the domains; `tracked` are the tracked corners.
+        `ids`, `tracked` and `volume` (m,), m^d, are points, tracked corners and volumes of the domains; `corners` are
+        the corners initialised from F.  A domain with a face on a prescribed side becomes a prism of the given volume.
         """
         return corners
 

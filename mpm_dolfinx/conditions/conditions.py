@@ -2,15 +2,15 @@
 """Conditions on sides of bodies: tractions, pressures, displacements, plates, drained sides, prescribed flux, rain.
 
 Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y),
-as before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes faces that
-touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).  Reference areas
-refer to the seeded shape, after the maps.
+by their position before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes
+faces that touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).
+Reference areas refer to the seeded shape, after the maps.
 
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
 balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-Values may be functions of time t, reference positions X and current positions x.  The parameter names decide; see
-`validation`.
+Values may be functions of time t, reference positions X and current positions x.  Their parameter names decide which
+they receive, see `validation`.
 
 An invalid condition raises a ValueError when the condition, a scene or a stage is created.  An invalid value of a
 function raises the error in the step that needs the value.  A condition is equal only to itself, because values and
@@ -129,9 +129,9 @@ class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
     The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
-    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; of oblique waves a few
-    per cent are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies
-    with weight need such a stage.
+    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; a few per cent of
+    oblique waves are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies with
+    weight need such a stage.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Quiet(Condition):
     ValueError
         From the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the side;
         another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid that
-        fixes it; a weight that changes as the stage begins, because the traction at rest does not change.
+        fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
     side: str
@@ -235,8 +235,8 @@ class Drained(Condition):
     region : ((d,), (d,)), m
         Box of reference positions; the parts of faces inside it are drained.
     seepage
-        Seepage face: where the outside pressure is <= 0, as above a water level, water can leave but not enter.  The
-        pore pressure there is at most the outside pressure, and lower only where no water leaves.
+        Whether the side is a seepage face: where the outside pressure is <= 0, as above a water level, water can leave
+        but not enter.  The pore pressure there is at most the outside pressure, and lower only where no water leaves.
 
     Raises
     ------
@@ -320,7 +320,7 @@ class Rain(Flux):
     given rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.  `outflows` of
     the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s (m^2/s in plane
     strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")`: outflow through
-    all open sides; `outcome("ran_off")`: run-off and seepage here; `outcome("ponded")`: water ponded on the side.
+    all open sides; `outcome("ran_off")`: run-off and seepage on this side; `outcome("ponded")`: ponded water.
 
     Parameters
     ----------
@@ -330,8 +330,8 @@ class Rain(Flux):
         Rain per current area of the side, as a volume at zero pressure.  Finite; negative for potential evaporation.
         Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
-        Largest pressure of ponded water, Pa, >= 0: depth times unit weight.  The pond has one depth for the whole side.
-        Water runs off once the pond is full; ponded water infiltrates or evaporates later.
+        Largest pressure of ponded water (depth times unit weight), Pa, >= 0.  The pond has one depth for the whole
+        side.  Water runs off once the pond is full; ponded water infiltrates or evaporates later.
     driest
         Lowest pressure at the side, Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By Kelvin's
         equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
@@ -394,18 +394,18 @@ The displacement error is (change of traction in the step, except by rotation) /
 does not accumulate, because each step measures it from the prescribed position.  Where a body is much stiffer than the
 penalty, multipliers remove the error, see `HoldLoads.augment`.
 
-Halving this value changes the result of scene `soil` in tests/plateaus.py by 5.9e-05 (relative), doubling it by
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.
 """
 WEAK = 8.0
 """Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).  Halving
-this value changes the result of scene `soil` in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
+this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
 finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of laws with a state, because yielding soil is much softer.  Halving
-this value changes the result of scene `soil` in tests/plateaus.py by 6.5e-05 (relative), doubling it by 1.9e-05, and
-finer cells by 3.0e-02.
+"""Factor on the elastic modulus in the penalty of laws with state variables, because yielding soil is much softer.
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by 1.9e-05,
+and finer cells by 3.0e-02.
 """
 
 
@@ -418,8 +418,9 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity,
-    3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and 30 times 4G gives 1.01 times the exact pressure.
+    difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity, a
+    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and of 30 times 4G, 1.01 times the exact
+    pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -447,7 +448,7 @@ class Displacement(Condition):
     ------
     ValueError
         From the scene or the step: no point on the side; invalid value or components; a moving component that a wall
-        fixes; another `Displacement` of a component on the same part of a face, or with another value at a common edge.
+        fixes; another `Displacement` of the component on the same part of a face, or other values at a common edge.
     """
 
     side: str

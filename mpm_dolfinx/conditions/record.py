@@ -19,7 +19,7 @@ class Record:
     """Recorded motion along a direction, as a function of time (s) that returns the displacement (d,), m.
 
     Recorded values are interpolated linearly in time and integrated exactly.  The motion is zero before the first
-    recorded time.  After the last one the velocity is constant.
+    recorded time.  After the last recorded time the velocity is constant.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ class Record:
     quantity
         Recorded quantity: "acceleration", m/s^2, or "velocity", m/s.
     at_rest
-        Correct the accelerations by a linear function of time, so that the motion ends at its initial position with
-        zero velocity.  Without the correction, a record with a non-zero integral ends with a velocity.
+        Whether to correct the accelerations by a linear function of time, so that the motion ends at its initial
+        position with zero velocity.  Without the correction, a record with a non-zero integral ends with a velocity.
 
     Raises
     ------

@@ -103,7 +103,7 @@ class Sides:
         return shorter if len(shorter) else faces  # the region is narrower than a cell
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return the length, m, to cut off a region that ends at coordinate x along an axis of reference positions.
+        """Return the length, m, by which to shorten a region that ends at coordinate x along a reference axis.
 
         `at_end` (m,) tells which faces of the side contain x; `sign` is the direction out of the region.  See `held`.
         """

@@ -25,7 +25,7 @@ def wall_forces(
     walls
         Names of the walls, and the components that each fixes.
     dofs : (n,)
-        Local degrees of freedom, unrolled; repetitions are allowed.  Free ones are ignored.
+        Local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.
     forces : (n,), N
         Forces on these degrees of freedom.
     """

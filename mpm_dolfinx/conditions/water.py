@@ -25,7 +25,7 @@ def water(
     """Return two conditions, which both belong in the scene, for still water at a side.
 
     Below the level, hydrostatic pressure acts on the surface and on the pore fluid.  Above the level, the side is a
-    seepage face.  Both follow the motion of the side in each step.
+    seepage face.  Both conditions follow the motion of the side in each step.
 
     Parameters
     ----------

@@ -6,9 +6,9 @@ Let q be the motion of a tool in a step: its displacement and, in 2D, its rotati
 motion without forces in the step, l is the load, and f are the contact forces on the points.  A q is the displacement
 of the contact positions on the tool.  The columns of A are e_x, e_y, and e_z x r with the lever arm r.
 
-The unknowns q are condensed.  Let D be minus the derivative of f by the displacement of the points, and dw their
-increment.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns 0, 0, e_z x f.  The force
-on the tool changes by the product of dq with
+The unknowns q are condensed.  Let D be minus the derivative of f by the displacement of the points, and dw the
+increment of this displacement.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns 0,
+0, e_z x f.  The force on the tool changes by the product of dq with
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
@@ -141,7 +141,7 @@ class FreeTools(ContactProblem):
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return bounds (m, q) of the generalised forces on the tools, from the sizes (m, d) of contact forces, N.
 
-        A moment is compared with lever arm times force: the moment of a smooth disc consists of rounding errors alone.
+        A moment is compared with lever arm times force, since the moment of a smooth disc consists of rounding errors.
         """
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])

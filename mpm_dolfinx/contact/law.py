@@ -17,8 +17,8 @@ with the projection P on the tangent plane.  Sticking contact is elastic with st
 The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
 cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
 traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
-that opens slips afterwards, and does so for good the second time.  Otherwise shear alone could open and close the
-contact under a round tool at first contact, where the mean normal is inclined.
+that opens slips afterwards; if it had returned from slip to stick before, it slips for good.  Otherwise shear alone
+could open and close the contact under a round tool at first contact, where the mean normal is inclined.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ContactState:
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
     resticks: NDArray[np.bool_]  # whether the condition has returned from slip to stick (k,)
-    parts: NDArray[np.bool_]  # whether it has opened after that (k,)
+    parts: NDArray[np.bool_]  # whether the condition has opened after this return (k,)
     stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
     raised: float = 1.0  # factor on the stiffness k
     off: float = np.inf  # penetration after the last augmentation, cells

@@ -358,7 +358,7 @@ def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return face coordinates (m, 2) and distances (m,) of intersections of lines from x along n (m, d) with faces."""
+    """Return where lines from x along n (m, d) intersect faces: face coordinates (m, 2), distances (m,), m, from x."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

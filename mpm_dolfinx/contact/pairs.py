@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Contact pairs: each pairs a quadrature point on a surface with a position on a tool or on another group.
+"""Contact pairs: a quadrature point on a surface, and the opposite position on a tool or another group of bodies.
 
-The relative displacement of a pair is w = B u.  The columns of B are the nodes of the point's cell and, between groups,
-the nodes of the cell on the other side.  A position on a tool moves with the tool.
+The relative displacement of a pair is w = B u.  The columns of B belong to the nodes of the point's cell and, between
+groups, of the cell on the other side.  A position on a tool moves with the tool.
 """
 
 from __future__ import annotations
@@ -126,12 +126,12 @@ class ToolPairs(Pairs):
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs of points on the surface of one group with opposite positions on another group, along normals."""
+    """Contact pairs of points on the surface of a group with opposite positions, along normals, on another group."""
 
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
-    n: NDArray[np.float64]  # outward unit normal of the other side there (m, d)
-    offset: NDArray[np.float64]  # vector from there to the point, without the displacement in the step (m, d), m
+    n: NDArray[np.float64]  # outward unit normal of the other side at y (m, d)
+    offset: NDArray[np.float64]  # vector from y to the point, without the displacement in the step (m, d), m
     place: NDArray[np.int64]  # number of the point, the same in all updates of the pairs in a step (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
@@ -160,7 +160,7 @@ def at_nodes(
 ) -> PETSc.Mat:
     """Return the matrix with values (m, 2^d) in the columns of the nodes of cells, for each component.
 
-    `other` are lexicographic cells of any process.  With them, values (m, 2 * 2^d) include the other nodes.
+    `other` are lexicographic cells of any process.  With `other`, values (m, 2 * 2^d) include the nodes of these cells.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)
@@ -188,7 +188,7 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
-    """Raise an error if a user function is no signed distance near the tool: its slope differs from 1."""
+    """Raise an error if a user function is no signed distance near the tool, because its slope differs from 1."""
     size = np.linalg.norm(n, axis=1)
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Contact problem of a substep, with tools or between groups of bodies.
 
-With the relative displacements w = B u of the pairs, nodal forces are B^T f(w).  Forces on both bodies are therefore
-equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken at the start of the
-step.  After convergence they are updated at the new positions, and the step is solved again.  This is repeated until
-the gaps match the faces at the end of the step.
+A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
+With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
+bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
+at the start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This
+is repeated until the gaps match the faces at the end of the step.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
 the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
@@ -57,7 +58,7 @@ class LinearMotion:
     """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
     The displacements are motion + shift + sum slope . (w' - w); the sum is over the pairs of a tool.  Newton's method
-    uses this line.
+    uses this linear function.
     """
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
@@ -67,7 +68,7 @@ class LinearMotion:
 
 
 class Found(NamedTuple):
-    """Contact at given displacements."""
+    """Geometry, forces and tool motions of a contact at given displacements."""
 
     at: Geometry  # geometry of the pairs
     touch: Touch  # forces of the pairs
@@ -132,9 +133,9 @@ class ContactProblem(Loads):
     pushes
         Loads of tools.
     again
-        Function from displacements, a local array, m, to law and origin of the pairs there, see `FacePairs`.
+        Function from displacements (a local array, m) to law and origin of the pairs found there, see `FacePairs`.
     cell_pairs
-        Function that returns all pairs of lexicographic cells of this process's pairs, as first * cells + second.
+        Function that returns all pairs of cells, as first * cells + second, that contact pairs may join in the step.
     """
 
     linear, smooth, touches = False, False, True
@@ -325,7 +326,7 @@ class ContactProblem(Loads):
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return initial displacements (tools,), m, for fixed bodies, at most until one point carries the load."""
+        """Return initial displacements (tools,), m, towards fixed bodies, at most until one point carries the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -337,7 +338,7 @@ class ContactProblem(Loads):
         return motion
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """See `Loads`.  The slipping set consists of the conditions that slip."""
+        """See `Loads`.  The conditions, one per contact and cell, change between stick and slip."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
         motion = self.found(at).motion
         if self.now.law.grips:
@@ -424,7 +425,7 @@ class ContactProblem(Loads):
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """See `Loads`.  Only tools do work.  Elastic slip in stick counts as dissipation, and is returned on unloading.
 
-        Contact pressures are taken to do no work: velocities of substeps jump where a gap closes in a step.
+        Contact pressures are taken to do no work, because velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)

@@ -114,8 +114,6 @@ class Ball:
         Centre of the sphere.
     radius
         Radius, m, > 0.
-    radius
-        m, > 0.
     """
 
     centre: ArrayLike
@@ -152,7 +150,7 @@ class Convex:
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
     The signed distance is the largest distance from the planes of the surface.  This is exact inside.  Outside, near
-    edges and corners, it is too small; but there is no contact.
+    edges and corners, it is too small, but no contact occurs there.
 
     Parameters
     ----------
@@ -229,8 +227,6 @@ class Cone:
         Tip of the cone.
     axis : (d,)
         Direction from the tip into the tool, of any length.
-    axis : (d,)
-        Direction from the tip into the tool; of any length.
     angle_deg
         Angle between axis and flank, degrees, in (0, 90); 30 for the cone of a CPT.
     """

@@ -77,7 +77,7 @@ class Ties(Acting):
 
     @property
     def surfaces(self) -> list[Surface]:
-        """Faces of one side of each tie."""
+        """Faces on the first side of each tie."""
         return [tie.one for tie in self._ties]
 
     def placed(self, place: Place) -> Loads:

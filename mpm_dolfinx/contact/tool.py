@@ -42,7 +42,7 @@ class Pose(NamedTuple):
         return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the current positions of positions y (m, d) in the frame of the tool."""
+        """Convert positions y (m, d) in the frame of the tool to current positions."""
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
@@ -58,7 +58,7 @@ def rotation(angle: float) -> NDArray[np.float64]:
 
 
 def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return the displacement of a tool by forces, m, from an outcome, followed by its rotation by forces, rad."""
+    """Return, from an outcome, the displacement of a tool by forces, m, then its rotation by forces, rad, if any."""
     angle = outcome.get("tool_rotation", {})
     by_forces = outcome["tool_travel"][name]
     return np.append(by_forces, angle[name]) if name in angle else by_forces
@@ -85,8 +85,8 @@ class Tool:
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0, at most ten times the normal pressure.  For undrained soil:
-        alpha s_u, with friction 0.
+        Additional shear strength of the contact, Pa, >= 0.  Where it exceeds ten times the normal pressure, it is
+        reduced to that value.  For undrained soil: alpha s_u, with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
         The tool moves along `direction`, in addition to its displacement, until the reaction equals the load, from the
         first step on.  The tool must start in contact, or less than a cell away.  `tool_travel` of the simulation
@@ -95,15 +95,15 @@ class Tool:
         Direction of the load, of any length.  In axisymmetry: along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
-        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  It keeps its
+        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  The tool keeps its
         position while an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity
         `outcome("tool_velocity")` (d,), m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
         Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
-        that of a uniform disc or polygon.  Without it, other shapes and tools with `direction` do not rotate.  Results
-        are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, do not rotate without a given
+        value.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
@@ -260,7 +260,7 @@ class Tool:
         self._check_turns(dim)
 
     def _check_turns(self, dim: int) -> None:
-        """Raise an error for invalid rotation of a free tool."""
+        """Raise an error for an invalid rotation of a free tool."""
         of, rotates = self._uniform(dim), self.rotates(dim)
         if dim == 3 and rotates:
             raise ValueError(f"Tool: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")

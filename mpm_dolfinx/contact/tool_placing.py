@@ -51,7 +51,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements of tools by loads, m, at the start and end of a step; with free tools (k, q), with rotations."""
+    """Displacements of tools by loads, m, at start and end of a step; with free tools (k, q), rotations included."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -247,7 +247,7 @@ class Tools(Touching):
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which positions that face a tool lie within half a cell of the tool's edge, where the body continues.
+        """Return which of the positions that face a tool lie within half a cell of its edge, where the body continues.
 
         The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
         than a cell keeps its whole contact.
@@ -364,7 +364,7 @@ class Tools(Touching):
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
         """Return a position x (n, d) whose path between two times (s) crosses a tool, or "" if there is none.
 
-        The paths are straight.  The search proceeds by the distance to the tool (sphere tracing: Hart 1996).
+        Paths are straight.  Steps of the search are as long as the distance to the tool (sphere tracing: Hart 1996).
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Fraction of a cell: volumes of intact domains reach 1.08 when a footing penetrates by half its width."""
+"""Largest filling of a cell without a warning; intact domains reach 1.08 when a footing sinks by half its width."""
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
@@ -49,7 +49,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
 
 
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
-    """Return the bodies in a cell, given by lexicographic number, and its midpoint (d,), m; collective."""
+    """Return the bodies in the cell with this lexicographic number, and its midpoint (d,), m; all processes call it."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
@@ -59,9 +59,9 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 LOSS = 0.03
 """Lost fraction of a soft material's deformation, in mixed cells, from which a warning is issued."""
 AGAIN = 2.0
-"""Growth of that fraction from one warning to the next, as interfaces move to the middle of cells."""
+"""Growth of the lost fraction from one warning to the next, as interfaces move to the middle of cells."""
 FINE = 0.1
-"""Fraction of a soft cell's deformation that counts as lost; stiffness contrasts below 2.1 stay below it."""
+"""Smallest lost fraction of a cell's deformation that counts; stiffness contrasts below 2.1 lose less."""
 
 
 def warn_smeared(
@@ -110,9 +110,9 @@ def warn_smeared(
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
     """Return the lost volumes (n,), m^d, of the softest material in owned cells, contrasts (n,), and its pieces (n,).
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M; equal strain in the
-    cell gives 1 / sum s M.  Their difference, over the largest 1/M, is loss: at most (1 - sqrt(r))^2 of the cell for
-    two moduli of ratio r < 1.
+    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M; with equal strain in
+    the cell it is 1 / sum s M.  Their difference, divided by the largest 1/M, is the loss, at most (1 - sqrt(r))^2 of
+    the cell for two moduli of ratio r < 1.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
@@ -127,11 +127,11 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
 
 
 COARSE = 0.7  # of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
-FEW = 3  # points over the thickness with an eighth too much bending.  Source: exact, 1 / (n^2 - 1)
-SLENDER = 4  # length over thickness from which a body counts as a beam
-LOST_WET = 2.5  # lost stiffness of wet beams times n^2: 1.8, 2.3, 3.2 with n = 4, 8, 16, sealed
+FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
+SLENDER = 4  # length / thickness from which a body counts as a beam
+LOST_WET = 2.5  # (lost fraction of a wet beam's stiffness) x n^2: 1.8, 2.3, 3.2 with n = 4, 8, 16, sealed
 FEW_WET = int((100 * LOST_WET) ** 0.5)  # points with a loss of 1 %.  Source: exact, by LOST_WET
-SLENDER_WET = 2  # length over thickness from which a wet body counts as a beam
+SLENDER_WET = 2  # length / thickness from which a wet body counts as a beam
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:

@@ -31,14 +31,14 @@ def check_held(
         Displacement components that no wall fixes.
     holds
         Constraints by prescribed displacements, tools and contact: cells (m,), lexicographic cells of the other part
-        (m,) or None, positions (m, d), m, and directions (m, d).  A constrained part constrains the other.
+        (m,) or None, positions (m, d), m, and directions (m, d).  A constrained part constrains the other part.
     each
-        Check each connected part, not only all parts together.
+        Whether to check each connected part, not only all parts together.
 
     Raises
     ------
     ValueError
-        With the place of the part and its number of free rigid-body modes.
+        A part can move as a rigid body.  The message gives its place, and its number of free rigid-body modes.
     """
     grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)

@@ -155,7 +155,7 @@ class CutDomains(Keyed):
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of plane sections."""
+        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -167,7 +167,7 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return means as in `mean` for values at centroids in the plane; in axisymmetry weighted by area."""
+        """Return means over pieces as `mean`; in axisymmetry weighted by plane area, for values at plane centroids."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
@@ -232,7 +232,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with the owners of cells, and their cells and positions (m, d), m, for corners or points."""
+        """Exchange with the owners of cells, and the cells and positions (m, d), m, of corners or points."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim

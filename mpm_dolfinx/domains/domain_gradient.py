@@ -73,7 +73,7 @@ def volume_slopes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the volumes (n,) of domains, m^d, and their derivatives (n, 2^d, d) by the corners, m^(d-1).
 
-    In axisymmetry volumes of rings, m^3, the integrals of pi r^2 dz around the domains, and their derivatives, m^2.
+    In axisymmetry, these are volumes of rings, m^3, integrals of pi r^2 dz around domains, and derivatives, m^2.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:
@@ -95,10 +95,10 @@ def cell_ratios(
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
     With mean dilatation, the ratio of a cell is the current volume of its domains, from their corners, divided by the
-    reference volume.  This ratio depends on no path, and its variation within the cell does no work.  Ratios that are
-    updated only by increments would drift from the domain volumes, since no force would oppose the drift.  Without
-    mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
-    volumes are meaningless near plastic flow.
+    reference volume.  This ratio does not depend on the path of deformation, and its variation within the cell does no
+    work.  Ratios that are updated only by increments would drift from the domain volumes, since no force would oppose
+    the drift.  Without mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded
+    soil, because corner volumes are meaningless near plastic flow.
 
     Parameters
     ----------

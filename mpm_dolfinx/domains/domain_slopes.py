@@ -69,9 +69,9 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of the face number: columns, face centres (m) and existence of the neighbours at the face.
+        """Return a function from face number to columns, face centres (m) and existence of the neighbours at the face.
 
-        `own` (c, k) are the columns of these points.  `faces` are the centres (d, k), m, of their faces.
+        `own` (c, k) are the data (columns) of these points.  `faces` are the centres (d, k), m, of their faces.
         """
         centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
@@ -108,7 +108,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, where F varies in `elastic` points (n,); all processes must call this method."""
+        """Return `linear_gradients`, with F varying only in `elastic` points (n,); all processes must call this."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils

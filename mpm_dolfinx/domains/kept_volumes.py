@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Particle domains of yielded soil keep the volumes of their points.
 
-The volume ratio of a point is a mean over its cell, but its corners follow a field that varies in the cell, along
-straight edges.  In elastic soil F and the ratios of cells follow from the corners.  In yielded soil F is incremental,
-so volumes of domains and points would drift apart, and cells would overfill.  After a step the corners of yielded
-domains therefore move by the smallest d with
+The volume ratio of a point is a mean over its cell, but the corners of its domain follow a field that varies in the
+cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In yielded
+soil F is incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the
+corners of yielded domains therefore move by the smallest d with
 
     sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2  ->  min,
 
 with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
 held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
-projection); volumes of domains need no second cut.
+projection); volumes of domains, unlike densities, need no second cut by the grid.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
-"""Weight of the motion.  Alternating volumes of a regular lattice do not change with its corners, to first order.
-Halving this value changes the result of scene `flow` in tests/plateaus.py by 1.3e-04 (relative), doubling it by
+"""Weight of the motion, needed because corners of a regular lattice do not change alternating volumes to first order.
+Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.3e-04 (relative), doubling it by
 3.2e-04, and finer cells by 9.2e-02.
 """
 
@@ -54,7 +54,7 @@ def with_volumes(
     volume : (n,), m^d
         Volumes of the points, > 0; in axisymmetry volumes of their rings, m^3.
     yielded : (n,)
-        Domains to correct.
+        Whether to correct the domain.
     free : (n, 2^d, d)
         Components of corners that may move.
     body, number : (n,), (n, 2^d)
@@ -98,9 +98,9 @@ def _motion(
 def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return numbers (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,); those that are one corner share one.
+    """Return numbers (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,), equal for equal corners.
 
-    They have one seeded number (n, 2^d), or they are within `tolerance`, m.
+    Corners are equal if they have the same seeded number (n, 2^d), or lie within `tolerance`, m.
     """
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:

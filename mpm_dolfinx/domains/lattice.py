@@ -39,7 +39,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
 """Fraction of a wave of two domains that the filter removes, for each crossed cell; at most 1.  Halving this value
-changes the result of scene `cycles` in tests/plateaus.py by 1.5e-04 (relative), doubling it by 3.4e-04, and finer cells
+changes the result of scene "cycles" in tests/plateaus.py by 1.5e-04 (relative), doubling it by 3.4e-04, and finer cells
 by 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
@@ -261,7 +261,7 @@ def given(
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, that pass no wall, and leave the grid only if they did `before` a correction."""
+    """Return corners (n, 2^d, d), m, clipped to the walls, and to the grid if they were in it `before` a correction."""
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]

@@ -212,7 +212,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factors (n,) of cells that keep increments (m,) in a cell between `low` and `high` (n,)."""
+    """Return the largest factors (n,) for cells, at which increments (m,) in a cell stay in [`low`, `high`] (n,)."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -261,7 +261,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor (m,) of a correction that respects the bounds.  It is equal for all pieces of a domain."""
+    """Return the factor (m,) with which a correction respects the bounds.  It is equal for all pieces of a domain."""
     first = np.diff(owner, prepend=-1).nonzero()[0]
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)

@@ -29,14 +29,14 @@ from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resamp
 
 GAP = 0.01
 """Largest gap, in cells, between faces of two domains that still count as one surface.  Halving this value changes the
-result of scene `flow` in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
+result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
 """
 CRUMB = NEAR
 """Area, as a fraction of the cell, below which a part is dropped; other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
 """Area limit, as a fraction of the cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
-Source: definition, a square half of an edge wide.
+Source: definition, a square as wide as half of one of the `EDGES` in a cell.
 """
 COVERED = 0.25
 """Largest difference between pieces' area and filled area of a cell, in cells.  Source: definition, one domain."""
@@ -138,7 +138,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return cells that cannot be renewed: with other points, several bodies, or faces of different conditions."""
+        """Return cells that cannot be renewed, as they contain other points, several bodies, or several conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -235,7 +235,7 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of each of these cells among the renewed cells."""
+        """Return the number of each of these cells among the renewed cells, which is the group of its new domains."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
@@ -362,7 +362,7 @@ class RefilledCells:
 
     @cached_property
     def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """The results of `remainders` and `outside`; each piece is one group."""
+        """The results of `remainders` and `outside`.  New domains from the same piece form a group, see `New`."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))

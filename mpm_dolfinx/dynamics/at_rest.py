@@ -29,8 +29,8 @@ def balancing_tractions(
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Return point ids (m,) and tractions (m, d), Pa per reference area, that replace the reactions of sides at rest.
 
-    Tractions follow from the stresses.  Their resultant forces and moments may differ from equilibrium of a part of the
-    bodies, which would set it in motion.  Rigid-body fields of tractions remove this difference.
+    Tractions follow from the stresses.  Their resultant forces and moments may not balance a part of the bodies, and
+    would then set this part in motion.  Rigid-body fields of tractions remove this difference.
 
     Parameters
     ----------

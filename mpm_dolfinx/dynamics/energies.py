@@ -2,7 +2,7 @@
 """Energies of bodies with inertia, and the work of forces on them.
 
 The work of forces f in a step is dt sum b_i f_i . v_i over its substeps, with the weights b_i of the time integration.
-The remaining difference from the kinetic energy is numerical dissipation, of the method and of grid resets.
+The difference from the change of kinetic energy is the numerical dissipation of the method and of grid resets.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 def initial_energies(
     materials: SceneMaterials, points: MaterialPoints, kinetic: float
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, at the start of the count, see `Result.energies`; `internal`: work of the stresses.
+    """Return the energies, J, from which `after` counts, see `Result.energies`; `internal` is the work of the stresses.
 
     kinetic: kinetic energy of free tools, J.
     """
@@ -48,7 +48,7 @@ def after(
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, after a step from the energies before it.
+    """Return the energies, J, after a step, from the energies before the step.
 
     kinetic: kinetic energy of free tools, J; seconds: time weights of the substeps, s; powers: powers of the substeps
     on this process, W, see `MomentumProblem.powers`.

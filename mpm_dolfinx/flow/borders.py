@@ -134,7 +134,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield rows of faces at owned mixed cells, with k_r (k,) and derivatives, see `Relative.through_sides`."""
+        """Yield indices (k,) of faces at owned mixed cells, k_r and derivatives (k,), see `Relative.through_sides`."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -150,7 +150,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the paths of all cells at these faces, ghosts from their owners."""
+        """Return the paths of all cells at these faces; owners send the paths of ghosts."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]

@@ -38,7 +38,7 @@ THICK = np.sqrt(2)
 
 The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) away from the plane.  A
 face that is closer to the centroid of the cell's material, or behind it, bounds only a part of the material, and must
-not drain the whole.
+not drain the whole cell.
 """
 
 
@@ -87,7 +87,7 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow, run-off and ponds before the first step: zero, or nothing without rain."""
+        """Return the volumes of outflow, run-off and ponds before the first step: zero, or no entries without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
@@ -174,7 +174,7 @@ class UnsaturatedFaces(OpenFaces):
     relative: Relative  # relative conductivities of the cells
     cells: NDArray[np.int32]  # cells behind the faces (m,)
     normal: NDArray[np.float64]  # unit normals (m, d)
-    outer: NDArray[np.float64]  # mass potential at the pressure outside - drop (m,), Pa
+    outer: NDArray[np.float64]  # mass potential at the pressure `outside - drop` (m,), Pa
     outside: NDArray[np.float64]  # pressure outside (m,), Pa
     drop: NDArray[np.float64]  # hydrostatic pressure drop from the centroid to the face (m,), Pa
 
@@ -277,7 +277,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return sides with the pressure and water supply of ponds over a time dt (s), and the ponds' capacities, m^d.
+        """Return sides with the pressure and water supply of ponds in a time dt (s), and the capacities of ponds, m^d.
 
         `ponds` are the largest depths, m.
         """
@@ -318,7 +318,7 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """See `Feeds`.  Seepage faces with outflow open; uncorrected cell pressures decide."""
+        """See `Feeds`.  Seepage faces become open if uncorrected cell pressures cause outflow."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
@@ -336,7 +336,7 @@ class SideFeeds(Feeds):
         return sum_by(at.at, self._counts(at) * (1 + self._share) * at.derivative(fluid), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
-        """Open seepage faces with outflow, and close the other seepage faces; return the number of changes."""
+        """Update the active set: seepage faces with outflow become open, others closed; return the count of changes."""
         flows = at.outflow(fluid) > 0
         changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
         self._flows = flows

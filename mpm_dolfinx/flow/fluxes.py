@@ -30,7 +30,7 @@ from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
-ALONG = 0.1  # smallest component of the unit normal along an axis, if a side determines the slope along it
+ALONG = 0.1  # smallest component of the unit normal along an axis, if a side determines the slope along this axis
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
 """Inclination of layers above which the pressure position of a cell moves to the most conductive part.  Halving this
-value changes the result of scene `slope` in tests/plateaus.py by 4.1e-04 (relative), doubling it by 5.0e-05, and finer
+value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative), doubling it by 5.0e-05, and finer
 cells by 3.4e-03.
 """
 PAIRS = 2**16
@@ -121,9 +121,9 @@ class MixedCells:
     ) -> Mobility:
         """Return the mobility of filled cells, from means (n,) and mobilities `kappa` of all pieces, m^2/(Pa s).
 
-        `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  In
-        unsaturated soil, `now` are mobilities of all pieces at their pressures.  The pressure then refers to the
-        centroid, unless layers are inclined.
+        `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  `now`
+        are the mobilities of all pieces at their pressures, in unsaturated soil.  If it is given, only inclined layers
+        shift the position of the cell pressure away from the centroid.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:

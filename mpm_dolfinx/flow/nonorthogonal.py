@@ -2,9 +2,9 @@
 """Non-orthogonal correction of fluxes between cells and through open sides.
 
 The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
-inclined to the grid, the two centroids also differ by a vector t along the face, of up to half a cell.  The resulting
-error does not decrease with h.  With the gradients g, in both cells, of the pressure minus the weight of the fluid, the
-corrected flux is
+inclined to the grid, the centroids of both cells also differ by a vector t along the face, up to half a cell.  The
+resulting error does not decrease with h.  With g, the pressure gradient minus the unit weight of the fluid in each
+cell, the corrected flux is
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t].
 
@@ -32,11 +32,11 @@ ALONG = 1e-4
 """Offset of two centroids along a face, in cells, up to which they need no correction."""
 NEAREST = 0.1
 """Lower bound, in cells, of the distances in the weights of the least-squares fit.  Halving this value changes the
-result of scene `slope` in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and finer cells by 3.4e-03.
+result of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and finer cells by 3.4e-03.
 """
 SIDES = 2.0
 """Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Halving
-this value changes the result of scene `slope` in tests/plateaus.py by 4.8e-06 (relative), doubling it by 2.8e-06, and
+this value changes the result of scene "slope" in tests/plateaus.py by 4.8e-06 (relative), doubling it by 2.8e-06, and
 finer cells by 3.4e-03.
 """
 
@@ -133,7 +133,7 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the gradients (rows, d), Pa/m, of the pressure minus the weight of the fluid.
+        """Return the pressure gradients minus the unit weight of the fluid (rows, d), Pa/m.
 
         Parameters
         ----------

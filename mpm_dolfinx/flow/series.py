@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-The soils between the pressure positions of two cells lie in series.  The pressures at their interfaces are local
+The soils between the pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local
 unknowns of each face.  Newton's method finds them from the continuity of the flux; they are then condensed.  Each soil
 conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
 therefore exact at any offset from the grid.
 
 The lines through a cell (see `layers`) that cross a single soil up to the face conduct in parallel.  All lines that
-cross several soils are combined to one line: in the order along the lines, each soil has its mean fraction of length.
+cross several soils are replaced by one.  Its soils follow in their order, each with its mean fraction of length.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
     Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; the first is saturated
-    soil.  The other lines are combined to one with s soils in series.
+    soil.  The other lines are replaced by one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
@@ -39,7 +39,7 @@ class Paths(NamedTuple):
     resistance: NDArray[np.float64]  # length / (mobility x fraction of lines) (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths with an index of the arrays."""
+        """Return the paths at an index of all arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
@@ -79,7 +79,7 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Segments of soil along the flow path through a face.  Each connects two nodes, which have pressures."""
+    """Segments of soil along the flow path through a face.  Each connects two nodes, positions with a pressure."""
 
     face: NDArray[np.int64]  # the face
     low: NDArray[np.int64]  # first node

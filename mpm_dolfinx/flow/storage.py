@@ -62,7 +62,7 @@ from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
 """Fraction of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].  Halving
-this value changes the result of scene `beam` in tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and
+this value changes the result of scene "beam" in tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and
 finer cells by 1.5e-02.
 """
 
@@ -94,7 +94,7 @@ class StorageForms:
     active
         Active part of the grid.
     materials
-        Materials of the scene, and its fluid. With retention curves the pieces have the fields retention, lever, pores.
+        Materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`, `pores`.
     weight : (d,), N/m^3
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
@@ -259,7 +259,7 @@ class StorageSystem:
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
         self.set_alternation()
-        _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
+        _add_diagonal(self.L, np.zeros(own.size))  # also of a cell without faces
         pattern = self.L
         if forms.softens:
             grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
@@ -278,7 +278,7 @@ class StorageSystem:
         return form and form.on(self._facets if relative is None else relative.uniform(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and no fixed positions, see `multigrid_solver`."""
+        """Return grid positions of this process's unknowns; the array of fixed positions is empty."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
@@ -372,7 +372,7 @@ class StorageProblem:
     inertial
         Function that returns the inertia forces on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
-        Suctions (n,), Pa, at which the pores of these cells drain, or None.
+        Suctions (n,), Pa, at which the pores of the active owned cells drain, or None.
     """
 
     def __init__(
@@ -424,7 +424,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the additional damping, minus the flow, of cells of softness (n,) and damping tau (n,), 1/Pa."""
+        """Return the matrix of additional damping in cells of softness (n,); tau (n,), 1/Pa: that of elastic soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -482,7 +482,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content caused by pressure errors (n,), Pa, and changes of it in the step (n,)."""
+        """Return errors of the water content caused by pressure errors (n,), Pa, and its changes (n,) in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume

@@ -204,13 +204,13 @@ class Relative:
         return k, np.maximum(derivative, 0.0)
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
-        """Set the fractions (n, count) of the filled owned cells, see `shares`."""
+        """Set `shares` in the filled owned cells to fractions (n, count)."""
         self.shares.x.array[:] = 0.0
         self.shares.x.array.reshape(-1, self.count)[filled] = shares
         self.shares.x.scatter_forward()
 
     def set_borders(self, contents, flow, places: NDArray[np.float64], moved: NDArray[np.float64]) -> None:
-        """Set the faces between cells of different soil for the current conductivities, see `borders`."""
+        """Store the faces between cells of different soil with their current conductivities, see `borders`."""
         borders = flow.mobility.borders
         make = partial(borders.faces, self._laws, contents, flow, places, moved) if borders else lambda: None
         self._borders(object(), make)

@@ -75,7 +75,7 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add rows (cells, n) for Q1 vectors in cells to `A`, which has one row per cell, without final assembly."""
+    """Add `rows` (cells, n) to `A`, without final assembly; `A` has a row per cell, a column per dof of Q1 vectors."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
@@ -112,7 +112,7 @@ class ElementForces:
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell, computed together with an element matrix A: kernels share common terms."""
+    """Further integrals over each cell, computed together with an element matrix A, because kernels share terms."""
 
     # UFL tensors T[i, k] (d, d), contracted like A: with grad v, or with grad v F, for each nodal displacement
     along: Sequence[ufl.core.expr.Expr] = ()

@@ -112,9 +112,9 @@ class FormPoints:
     def gradient(self, u: fem.Function) -> fem.Function:
         """Return grad u at the points as a coefficient, for a Q1 vector function u; numpy evaluates it.
 
-        UFL derivatives by u do not see this dependence.  All forms at the same u share the values.  In 3D the Taylor
-        series has many terms; with the coefficient a kernel of Hencky's law takes at most half of the time, its
-        compilation a fifth.
+        UFL derivatives by u do not see this dependence.  All forms at the same u share the values.  UFL would otherwise
+        expand u as a Taylor polynomial about the cell's midpoint, with many terms in 3D.  With the coefficient instead,
+        a kernel of Hencky's law takes at most half of the time to run, and a fifth of the time to compile.
         """
         if "gradient" not in self.live:
             values = u.x.array
@@ -172,9 +172,9 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`.  None for points: zero.
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`.  None, for points, means zero.
     hoop : (n, 4)
-        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None for points: moments of points.
+        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None, for points, means moments of points.
     """
 
     def __init__(
@@ -221,7 +221,7 @@ class Places(Keyed):
 
     @cached_property
     def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
-        """For each axis: products (n,) of offsets along sets of other axes, or their means, see `Grid.monomials`."""
+        """For each axis: sets of other axes, as bits, with (mean) products (n,) of offsets, see `Grid.monomials`."""
         along = []
         for axis in range(self.grid.dim):
             others = [a for a in range(self.grid.dim) if a != axis]
@@ -364,7 +364,7 @@ class Rows:
     def __call__(
         self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """Return the rows of the chosen points, at the start of the buffer.  `live` is the result of `live`."""
+        """Return the rows of the chosen points, at the start of the buffer.  `live`: result of the method `live`."""
         if isinstance(chosen, slice):
             key = (data.key, chosen.start) if chosen.start else data.key
             rows, dofs = self._packed(key, lambda: self._pack(data, chosen))
@@ -514,7 +514,7 @@ class PointExpression:
     def evaluate(
         self, data: PointData, chosen: NDArray[np.int64] | None = None, live: dict[str, NDArray] | None = None
     ) -> NDArray[np.float64]:
-        """Return the values (m, *shape) at chosen points, by default all.  `live`: the result of `live`, if known."""
+        """Return the values (m, *shape) at chosen points, by default all.  `live`: result of the method `live`."""
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)
         out, start = np.empty((count, self._values.shape[1])), 0
@@ -532,7 +532,7 @@ class PointExpression:
 
 
 class CellSums:
-    """Sums over the points of each cell.  Through DG0 test functions the assembler adds them up.
+    """Sums over the points of each cell.  The assembler adds up the points through DG0 test functions.
 
     Parameters
     ----------

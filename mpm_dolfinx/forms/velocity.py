@@ -34,6 +34,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set own, the time increment (s), and past, a multiple of the current u, at the active dofs."""
+        """Set `own`, s, and at the active dofs the field `past` to the argument `past` times the current u."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

@@ -32,7 +32,7 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Axis and end of each side of a box: (axis, 0 for the lower or 1 for the upper end)."""
-REACH = 1e-4  # cells: bodies may lie outside the grid by this distance, by which a penalty misses a wall
+REACH = 1e-4  # cells: bodies may lie outside the grid by this distance, because a penalty holds them at walls inexactly
 
 TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
@@ -112,7 +112,7 @@ class Cells:
     num_owned, num_local
         Number of cells without and with ghosts.
     cell_nodes, signs
-        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from the midpoint to each (2^d, d).
+        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from midpoint to nodes (2^d, d).
     at
         Current positions.
     cell_number, locals, owners
@@ -215,9 +215,9 @@ class Grid:
         points (parameters t, x or both) returns the same number of lines, between the same sides.  A tool must be a
         condition of the first stage; lines stay in stages without it.
     axisymmetric
-        The first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes, forces
-        and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left" is
-        the axis, where radial displacements are zero.
+        Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
+        forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
+        is the axis, where radial displacements are zero.
 
     Raises
     ------
@@ -638,7 +638,7 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the factors (n, 2^d) of the shape functions, which are linear, for each axis."""
+        """Return for each axis the factors (n, 2^d) of the shape functions, which are linear along this axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 

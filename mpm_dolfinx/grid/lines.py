@@ -17,7 +17,7 @@ MOST = 2**31 - 1
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the largest rounding error, m, of coordinates like x."""
+    """Return the largest rounding error, m, of coordinates as large as x."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 

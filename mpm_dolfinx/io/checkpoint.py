@@ -352,7 +352,7 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
 
 
 def _check_trend(trend: Trend, points: MaterialPoints) -> None:
-    """Raise ValueError for a trend that does not belong to the points."""
+    """Raise ValueError for a `Trend`, the motion in the last steps, that does not belong to the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d, 1 + d)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())

@@ -49,16 +49,16 @@ class Writer:
 
     * `points.pvd`: the particle domains as solid cells.  Fields are displacement, pore pressure, F, J, all data of the
       points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
-    * `history.csv`: one row for each output time, with counts of `Result`, smallest and largest pressure, quantities at
-      probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan before the first
-      step of a stage;
+    * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
+      quantities at probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan
+      before the first step of a stage;
     * `fields.txt`: meaning and unit of each of these fields;
     * with tools, `tools.pvd`: the parts of the grid cells inside the tools, with the forces of the tools;
     * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`) by components, zero in empty cells.
 
     ParaView and VTK read all files; meshio reads the points.
 
-    The new run continues the output up to the current time that is already in the folder.  A writer created after
+    If the folder has output from before the current time, the new run continues this output.  A writer created after
     `resume` therefore leaves the same files as a run without interruption.
 
     A writer locks its folder against other processes until `close`, the end of its context, or its deletion.
@@ -80,7 +80,7 @@ class Writer:
         An argument of the wrong type.  Files in the folder that no writer has written, or with other columns.  A run of
         another simulation, or one that starts at another time.  A closed writer.
     OSError
-        The folder is not writable, or the disk is full.  `simulation.run(..., after=simulation.result)` continues.
+        The folder is not writable, or the disk is full.  To continue: `simulation.run(..., after=simulation.result)`.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):

@@ -14,9 +14,9 @@ the plastic multiplier dgamma from 6G dgamma / M^2 = exp(h) - 1:
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a), the change of the stress ratio: Q / (M P) = sqrt(w) exp(-d/2).  On the yield surface
-a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at isotropic
-stresses and at the critical state (a = 0).
+The local unknown is d = 2 (h - a).  It gives the stress ratio at the end, Q / (M P) = sqrt(w) exp(-d/2).  On the yield
+surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
+isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the
 equation has no solution and the time step is reduced.
@@ -48,7 +48,7 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A constant derived from other constants."""
+    """A bulk modulus that the class derives from other constants: it replaces none given by the user."""
 
     follows = True
 
@@ -158,14 +158,14 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def trial(F, prestretch, plastic):
-        """Return the volume strain e_v and the squared deviatoric strain, e_s^2 = 2/3 e : e, of the trial strain."""
+        """Return the trial strain, its volume strain e_v, and its squared deviatoric strain e_s^2 = 2/3 e : e."""
         strain = Trial(F, plastic, prestretch)
         e = strain.deviatoric
         return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
 
     @staticmethod
     def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the residual of the equation for d: the flow rule on the yield surface."""
+        """Return the residual of the equation for d, which is the flow rule on the yield surface."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
@@ -203,7 +203,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a function of Modified Cam Clay evaluated with lambda(s) and P_c(s) at the suction s."""
+    """Return a function of Modified Cam Clay that is evaluated with lambda(s) and P_c(s) at the suction s."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -240,7 +240,7 @@ class BarcelonaBasic(ModifiedCamClay):
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
     This is the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  At constant
-    suction the law is Modified Cam Clay with lambda(s); for saturated soil, with lambda(0).  Bishop's stress alone
+    suction the law is Modified Cam Clay with lambda(s), and in saturated soil with lambda(0).  Bishop's stress alone
     determines the strength due to suction and the swelling on wetting.  The suction is evaluated at the end of a
     substep.  Suction has no effect once P_c0 is below P_r.
 

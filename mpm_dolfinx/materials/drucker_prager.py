@@ -33,7 +33,7 @@ MATCHES = {
 """Parameters (eta, xi) of the cone as functions of tan phi, sin phi and cos phi, for each match to Mohr and Coulomb."""
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under the square root, so that its derivative is finite at zero.
-Halving this value changes the result of scene `soil` in tests/plateaus.py by 2.3e-11 (relative), doubling it by
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.3e-11 (relative), doubling it by
 1.0e-11, and finer cells by 3.0e-02.
 """
 
@@ -47,13 +47,13 @@ class DruckerPrager(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90).
     dilation
-        Dilation angle psi, degrees, in [0, friction].  If it equals the friction angle, flow is associated and the
-        tangent is symmetric.
+        Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated and the tangent
+        symmetric.
     cohesion
         Cohesion c_0, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     hardening
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa.  kappa is the accumulated plastic strain (work
-        conjugate to c in associated flow).
+        conjugate to c, if flow is associated).
     match
         Stress states in which the cone agrees with Mohr and Coulomb's surface: "plane strain" (equal collapse load,
         exact for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In
@@ -129,7 +129,7 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the stress and the hardening after the return to the yield surface; drag: viscosity / time, Pa.
+    """Return the stress and the hardening after the return to the yield surface; drag: viscosity / time step, Pa.
 
     Returns
     -------

@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return the form data of material points `rows`; values (n, ...): F, parameters and state of all points."""
+        """Return data for forms at the points with indices `rows`; values (n, ...): F, parameters and state of all."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return names and values (n, ...) of the state at the end of a step; data have F at the end; dt: step, s."""
+        """Return names and values (n, ...) of the state at the end of a step of dt, s; `data` contain F at the end."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -189,9 +189,9 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws as UFL constants; the caller sets the value of the time.
+    """Return the arguments `BY_SCENE` of laws, time and cell size, as UFL constants; the caller sets the time.
 
-    points: integration points of the law; on grids of several cell sizes they store their cell size.
+    points: integration points of the law; on a grid of several cell sizes each of them stores the size of its cell.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -201,14 +201,14 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube with the volume of a cell, or of the largest cell of the grid, m."""
+    """Return the edge of a square or cube with the volume of a cell, m; in uneven grids, of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
 
 MOST = 100.0
 """Upper limit of the softness (elastic / tangent shear modulus), which is infinite in perfectly plastic flow.  Halving
-this value changes the result of scene `soil` in tests/plateaus.py by 4.0e-03 (relative), doubling it by 5.0e-03, and
+this value changes the result of scene "soil" in tests/plateaus.py by 4.0e-03 (relative), doubling it by 5.0e-03, and
 finer cells by 3.0e-02.
 """
 
@@ -216,9 +216,9 @@ finer cells by 3.0e-02.
 class SoftnessAtPoints:
     """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
 
-    Volume strains that alternate from cell to cell grow with the strain.  The pressure that balances such a volume
-    strain is volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant
-    stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
+    Volume strains that alternate from cell to cell grow with the strain.  Such a volume strain causes pressures of
+    volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.
+    tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent shear modulus
     is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the

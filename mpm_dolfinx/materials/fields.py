@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Materials of a scene at its material points: parameters as functions of position, states, several laws."""
+"""Materials of a scene at its material points.  Parameters may depend on position, and laws may differ."""
 
 from __future__ import annotations
 
@@ -34,14 +34,13 @@ RESERVED = frozenset(
 """Reserved names of quadrature point data, not available for parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""Change of a state variable from its initial value above which a point counts as yielded.  Halving this value changes
-the result of scene `soil` in tests/plateaus.py by 6.6e-05 (relative), doubling it by 1.4e-04, and finer cells by
-3.0e-02.
+"""Change of a state variable from its initial value above which the soil at a point has yielded.  Halving this value
+changes the result of scene "soil" in tests/plateaus.py by 6.6e-05 (relative), doubling it by 1.4e-04, and finer cells
+by 3.0e-02.
 """
 STIFFEST = 100.0
-"""Upper limit of alpha^2 / S, divided by the skeleton's modulus lambda + 2G; it limits rounding errors.  Halving this
-value changes the result of scene `soil` in tests/plateaus.py by 1.2e-07 (relative), doubling it by 1.0e-07, and finer
-cells by 3.0e-02.
+"""Upper limit of (alpha^2 / S) / (lambda + 2G), which limits rounding errors.  Halving this value changes the result of
+scene "soil" in tests/plateaus.py by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
 """
 
 
@@ -83,7 +82,7 @@ class SceneMaterials:
         each = zip(self._used, evaluated, in_space, strict=True)
         known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
-        """Size of the deformation gradients of laws, 2 or 3."""
+        """Number of rows of the deformation gradients that laws receive, 2 or 3."""
         if self.across:
             seeded[ACROSS] = np.ones(len(points))
         if prestressed:
@@ -121,7 +120,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Fingerprints of parameter fields and of laws of flow, for checkpoints."""
+        """Sampled values of parameter fields and of laws of flow, by which a checkpoint recognises the scene."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -169,7 +168,7 @@ class SceneMaterials:
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
-        """Return the size of a law's deformation gradients, 2 or 3."""
+        """Return the number of rows of the deformation gradients that a law receives, 2 or 3."""
         return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
@@ -215,8 +214,9 @@ class SceneMaterials:
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
         """Return (law, integration points, whether Q1 cells would lock) for each part of the scene's points.
 
-        If a law has nearly incompressible materials and others, its points are split in two.  A single part uses
-        `pieces`.  Several parts have their own integration points: fields `common`, parameters and state of the law.
+        A part contains the points of one law.  If only some of its materials are nearly incompressible, the law has two
+        parts.  A single part uses `pieces`.  Several parts have their own integration points, with the fields `common`
+        and the parameters and state of the law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -249,9 +249,10 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return a key (n, 2) of each point, equal for equal conductivities: conductivity, m/s, and index of the law.
+        """Return two numbers (n, 2) for each point: conductivity, m/s, and index of the conductivity law.
 
-        With a law that depends on position all keys differ.  The fraction of the index denotes the retention curve.
+        Points with equal numbers conduct alike; with a law that depends on position all differ.  The fraction of the
+        index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -263,7 +264,7 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's retention curve (n,), from 1; 0 if pores stay saturated."""
+        """Return the number (1, 2, ...) of each point's retention curve (n,); 0 if the pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
@@ -302,9 +303,10 @@ class SceneMaterials:
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return value(material, *columns) at the points (n, ...); columns (n,): values at the points.
+        """Evaluate the function `value(material, *columns)` at the points and return the results (n, ...).
 
-        `value` returns one value per point, or one number; for a uniform material without columns also one value (...).
+        `columns` are further point data (n,), passed to the function.  It returns one value per point, or one number;
+        for a uniform material without columns also one value (...).
         """
         each, shapes = [], set()
         for i in self._used:
@@ -318,7 +320,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return points with updated derived fields after a change of the `named` fields.
+        """Return the points with updated fields that depend on the `named` fields, which have changed.
 
         Raises
         ------
@@ -385,7 +387,7 @@ class SceneMaterials:
         return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
 
     def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the storage coefficient at a porosity of one (n,), 1/Pa."""
+        """Return the storage coefficient (n,), 1/Pa, for a porosity of 1."""
         return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
 
     @property
@@ -394,7 +396,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the specific yield of the points and the suction, Pa, at which it has drained, as an array (n, 2)."""
+        """Return an array (n, 2): specific yield of the points, and suction, Pa, at which it has drained."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -452,7 +454,7 @@ class SceneMaterials:
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return a key (n, c) of each point, equal for equal elastic constants, for any initial stress."""
+        """Return constants (n, c) that are equal for points of soil with equal elasticity, for any initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -508,7 +510,7 @@ class SceneMaterials:
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of dt, s; before: points at the start; points: with F at the end.
+        """Return the point data after a step of dt, s, from the points before the step, and `points` with F after it.
 
         Raises
         ------
@@ -539,7 +541,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return every law with the indices and the form data of its points."""
+        """Return every law with the indices of its points, and their data for forms."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -564,7 +566,7 @@ def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _takes(law: type[Skeleton]) -> list[str]:
-    """Return the names of a law's parameters and state."""
+    """Return the names of the parameters and state variables of a law."""
     return [*law.parameters, *law.state]
 
 

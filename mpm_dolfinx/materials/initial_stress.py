@@ -25,9 +25,9 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-EXACT, CLOSE = 1e-13, SAME  # errors of the stress / largest initial stress: at which Newton's method ends, and allowed
-MOST = 30  # Newton iterations
-LARGEST = 0.2  # change of a strain component in one iteration
+EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress at which Newton's method ends; largest allowed one
+MOST = 30  # largest number of Newton iterations
+LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class K0:
     The vertical stress is the overburden of soil and fluid plus the surcharge, minus biot times the pore pressure.  The
     horizontal stresses (radial and circumferential in axisymmetry) are K0 times the vertical stress.  These stresses
     are exact for level ground with level layers.  Otherwise an equilibrium step follows.  A warning is given if it
-    changes them by more than 5 %, as on slopes.
+    changes the stresses by more than 5 %, as on slopes.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Hydrostatic(OfWater):
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
-    """Return the initial stress of each body; a single one applies to all bodies present at the start."""
+    """Return the initial stress of each body; a single given stress applies to all bodies present at the start."""
     allowed = "a K0, a function of x, or one of these for each of some bodies, {index: ...}"
     if given is None:
         return {}
@@ -196,7 +196,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return overburden, Pa, surface height, m, and biot times pore pressure, Pa, at the points, for K0."""
+        """Return three arrays (n,) for K0: overburden, Pa, surface height, m, and biot times pore pressure, Pa."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -221,7 +221,7 @@ def stressed(
 ) -> MaterialPoints:
     """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter; in other laws elastic strain: `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter.  In other laws elastic strains cause it: `_ElasticStrains`.
 
     Raises
     ------
@@ -253,7 +253,7 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method: logarithms of `seeded_stretch`, or of C_p^-1, halved."""
+    """Elastic strains for target stresses, by Newton's method: ln `seeded_stretch`, or half of ln C_p^-1."""
 
     materials: SceneMaterials
     points: MaterialPoints  # n points

@@ -6,10 +6,10 @@ with errors of round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-with the value y* and the derivative of the solution with respect to F.  UFL's derivative of a stress with respect to y
-and F is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.  If the
-stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.  Then y
-has a second-order term, whose coefficients also follow from f = 0.  A law in numpy may instead return y(z) and dy/dz.
+which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress with respect
+to y and F is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.
+If the stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.
+Then y has a second-order term, whose coefficients also follow from f = 0.  A law in numpy may return y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
 from mpm_dolfinx.parallel.exchange import first
 
-MOST, HALVINGS = 60, 25  # Newton iterations, and step halvings in all iterations together
+MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
 
 
 class Solved(NamedTuple):
     """Solution of the local equations at n points."""
 
-    key: object  # of the points' data
+    key: object  # identifies the points' data for which the equations were solved
     unknowns: NDArray[np.float64]  # (n, m)
     trial: NDArray[np.float64]  # trial values (n, k)
     derive: Callable[[], Derived]  # function that returns the derivatives

@@ -6,11 +6,11 @@ stresses t_1 >= t_2 >= t_3, tension positive,
 
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
-flow is along (1 + sin psi) e_i - (1 - sin psi) e_j and along e_i.  The return mapping keeps the order of the principal
-values.  It therefore ends on one of ten faces, edges and vertices, `_Return` (de Souza Neto, Peric and Owen 2008, 8.2,
-without the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
-admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the least violation is used;
-the violation is round-off.  The computation is in numpy.  Derivatives are exact also for equal principal values.
+flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along e_i.  The return mapping keeps the order
+of the principal values.  It therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric
+and Owen 2008, 8.2, without the cut-off).  On each of them the final stress is linear in the trial stress.  A final
+stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the
+least violation is used; the violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the candidates for the return
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # candidates for the final stress in the list of `end`
 NEVER = 1e6  # default tensile strength / bulk modulus
 
 
@@ -42,12 +42,12 @@ class MohrCoulomb(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, with the undrained strength `cohesion`.
     dilation
-        Dilation angle psi, degrees, in [0, friction].  If it equals the friction angle, flow is associated and the
-        tangent is symmetric.  Soil in tension at the apex dilates at any angle.
+        Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated, with a symmetric
+        tangent.  Soil in tension at the apex dilates at any angle.
     cohesion
         Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
-        Tensile strength T, Pa, >= 0: upper limit of the principal stresses.  By default that at the apex, c cot phi.
+        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default c cot phi (at the apex).
 
     Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
 
@@ -79,7 +79,7 @@ class MohrCoulomb(Frictional):
 
     @property
     def strength(self):
-        """2 c cos phi, Pa."""
+        """Constant 2 c cos phi of the yield functions, Pa."""
         return 2 * self.cohesion * np.cos(np.radians(self.friction))
 
     @property
@@ -96,7 +96,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return the components of the stress at the end, Pa, with derivatives, and whether there was plastic flow."""
+        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow, else 0."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -209,12 +209,15 @@ class _Return:
         return stresses, slopes, violation[best, n]
 
     def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
-        """Return the violation (n,), Pa, of yield functions and order at stresses t, and of multipliers >= 0."""
+        """Return the largest violation (n,), Pa, of three conditions.
+
+        These are yield functions <= 0, principal stresses t in descending order, and multipliers >= 0 (times 2G).
+        """
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the stresses on a face or an edge of two faces, their derivatives, and their violation."""
+        """Return the final stresses on a face, or on the edge of two faces, their derivatives, and their violation."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops
@@ -226,7 +229,7 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses at a vertex, zero derivatives, and violation; conditions: function, result >= 0 in flow."""
+        """Return stresses t at a vertex, zero derivatives and the violation; conditions: such as `_in_apex`."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
@@ -238,11 +241,11 @@ class _Return:
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Return quantities as in `_in_apex`, for the two faces at t_2 = t_3 and the cut-off of t_1."""
+        """As `_in_apex`, for the vertex of two faces with t_2 = t_3 and the cut-off of t_1."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Return quantities as in `_in_apex`, for the two faces at t_1 = t_2 and the cut-offs of t_1 and t_2."""
+        """As `_in_apex`, for the vertex of two faces with t_1 = t_2 and the cut-offs of t_1 and t_2."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

@@ -20,7 +20,7 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of point data in the seeded state, which are the reference for yield."""
+"""Suffix of the names of state variables as seeded; a point has yielded if its state differs from them."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:

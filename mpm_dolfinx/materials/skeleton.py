@@ -31,22 +31,21 @@ DRIED = ("suction", "suction_at_start")
 """States that the scene sets: the suction max(-p, 0), Pa, at the end of a substep, and at seeding."""
 
 LOCKING = 0.43
-"""Poisson's ratio above which cells use the mean dilatation, at twice the cost of a step.
+"""Poisson's ratio above which cells use the mean dilatation, which doubles the run time of a step.
 
-Errors of the drained beam's tip deflection without and with mean dilatation, h = 0.015 m: -0.02 and +0.22 % (nu =
-0.3), -0.44 and +0.21 % (0.45), -2.0 and +0.21 % (0.49), -10.3 and -0.02 % (0.499).  h = 0.06 m: -56, -0.4 % (0.499).
+Errors of the drained beam's tip deflection without and with mean dilatation, h = 0.015 m: -0.02 and +0.22 % (nu = 0.3),
+-0.44 and +0.21 % (0.45), -2.0 and +0.21 % (0.49), -10.3 and -0.02 % (0.499).  For h = 0.06 m: -56, -0.4 % (0.499).
 """
 
 SEPARATION = 1e-4
-"""Relative difference added between equal eigenvalues, so that their derivatives are finite.  Halving this value
-changes the result of scene `beam` in tests/plateaus.py by 1.8e-09 (relative), doubling it by 7.2e-09, and finer cells
-by 1.5e-02.
+"""Relative difference added to equal eigenvalues, for finite derivatives.  Halving this value changes the result of
+scene "beam" in tests/plateaus.py by 1.8e-09 (relative), doubling it by 7.2e-09, and finer cells by 1.5e-02.
 """
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Porous skeleton: base of all laws.  Numbers may vary with position, see `Field`.
+    """Porous skeleton, the base class of all laws.  Parameters may vary with position, see `Field`.
 
     Parameters
     ----------
@@ -70,7 +69,7 @@ class Skeleton:
         the cell at the start of the substep, Pa).
     retention
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
-        see `retention`; keyword only.  None: pores stay saturated.
+        see `retention`; keyword only.  With None the pores stay saturated.
 
     A law adds its parameters as fields of the dataclass and defines one of the static methods below.  These may have
     the arguments F, and fields, properties and state of the law.  F is (d, d), in axisymmetry (3, 3) with the
@@ -94,10 +93,10 @@ class Skeleton:
     solution
         Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
         returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
-        name of the trial value.  It suits return mappings with many cases, and existing codes.  The unknowns are then
-        stress and new state.  A derivative may be a function without arguments, called when a tangent is assembled.  A
-        missing derivative is zero.  If there is no solution, values are NaN or infinite; the time step is then reduced.
-        If `energy` is not stationary in these unknowns, second derivatives are missing and Newton's method is slow.
+        name of the trial value.  It suits return mappings with many cases, and existing codes.  Its unknowns are the
+        stress and the new state.  A derivative may be a function without arguments, called when a tangent is assembled.
+        A missing derivative is zero.  If there is no solution, values are NaN or infinite; the time step is then
+        reduced.  If `energy` is not stationary in them, second derivatives are missing and Newton's method is slow.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
         have F itself as argument.  Values other than UFL are passed to `kirchhoff` and `update` only, in `trial`.
@@ -292,12 +291,12 @@ class Skeleton:
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return tau, 1/Pa: a quarter of the jump stabilisation of 2 x 2 cells, or half of it for laws with a state.
+        """Return the damping tau, 1/Pa: 1/4 of the jump stabilisation of 2 x 2 cells, or 1/2 for laws with a state.
 
         The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
         and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is smaller by a factor of up to
         0.44.  In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards
-        in plane strain.  The damping acts on the increment of a step: an oscillation from the onset of yield remains.
+        in plane strain.  Only the increment of each step is damped, so an oscillation from the onset of yield remains.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -456,7 +455,7 @@ class unsaturated:
     least
         Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  If it is 0, a free surface falls at once: for steady flow.
+        Drainable porosity, in [0, 1), at most the porosity.  With 0, for steady flow, a free surface falls at once.
     """
 
     suction: float

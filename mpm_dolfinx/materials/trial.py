@@ -3,7 +3,7 @@
 
 In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
 smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because the nodes are kept separate.
-Principal values that depend on all three eigenvalues, with kinks, have exact derivatives in numpy, see `Coaxial`.
+If the principal values have kinks and depend on all three eigenvalues, `Coaxial` gives exact derivatives in numpy.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ points
     Quadrature points.  `points.dx` is their measure, which adds up to the volumes of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v; the gradient is (3, 3) in
     axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, of the same shape, with
-    the volume ratio as determinant.  `points.position` and `points.displacement` are position and displacement at the
-    start of the step, since the start of the run or the last reset.  Other names: fields of materials that are
-    functions of position, and the laws' state.
+    the volume ratio as determinant.  `points.position` and `points.displacement` are the position, and the displacement
+    since the start of the run or the last reset, both at the start of the step.  Other names: fields of materials that
+    are functions of position, and the laws' state.
 t
     Time at which the balances hold, s, a UFL constant: the end of the step or of its first substep.
 
@@ -106,7 +106,7 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict of a user-defined function as UFL with the given shapes; some: whether names may be missing.
+    """Return the dict that a user-defined function gave, as UFL with the given shapes; some: names may be missing.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Derivatives of nodal forces with respect to the cells' pressures, through laws that depend on suction.
 
-The stress of such a law depends on the pressure in addition to the term chi p of Bishop's stress. The mean stress pi of
-cells with mean dilatation depends on the pressure too.
+The stress of a law that depends on suction depends on the pressure twice: through the law, and through the term chi p
+of Bishop's stress. In cells with mean dilatation, the mean stress pi depends on the pressure too.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class OfSuction:
             (self._locked if locks else self._free)[number] = CellSums([*along, *scalars], points)
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return cells (c,), and the derivatives (c, n), m^(d-1), of nodal forces with respect to their pressures."""
+        """Return for each part its cells (c,), and derivatives (c, n), m^(d-1), of nodal forces by their pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

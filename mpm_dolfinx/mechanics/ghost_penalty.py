@@ -6,10 +6,10 @@ affect neither the conditioning nor the accuracy. The penalty resists each step'
 not act on load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 as the ratio of the emptier to the fuller cell's filling rises to RATIO. A
-  second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell). Empty cells
-  thus follow full ones at almost no work. Between equally filled cells a penalty would resist kinks of the body itself.
+  second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell).  Nearly
+  empty cells thus follow full ones easily.  A penalty between equally filled cells would resist kinks of the body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
-  stretch of the full neighbour, against their own volume constraint. In flowing soil even 2G is reduced: `stiffness`.
+  stretch of the full neighbour, against their own volume constraint.  In flowing soil `stiffness` is below 2G.
 
 With integration at the material points, any cell may hold too few points for its nodes. Then all faces of cells that
 are not full have a penalty of strength 0.2.
@@ -31,18 +31,17 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty.  Halving this value changes the result of scene `beam` in tests/plateaus.py by 9.9e-06
+"""Strength of the ghost penalty.  Halving this value changes the result of scene "beam" in tests/plateaus.py by 9.9e-06
 (relative), doubling it by 1.9e-05, and finer cells by 1.5e-02.
 """
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""Ratio of the volume fractions of two neighbouring cells below which their common face is penalised.  Halving this
-value changes the result of scene `soil` in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer
-cells by 3.0e-02.
+"""Ratio of volume fractions of two neighbours below which their face has the penalty.  Halving this value changes the
+result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Strength of the penalty with integration at the points; volume fraction below which faces of a cell have it."""
+"""With integration at the points: strength of the penalty, and volume fraction below which faces of a cell have it."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
@@ -84,7 +83,7 @@ class GhostPenalty:
     shear
         Shear modulus, Pa, of laws with a state: mean over the material in the cell; zero for other laws.
     firmness
-        Form of the elastic shear stiffness of whole cells, times their volume fraction; it regularises tangents.
+        Form of the elastic shear stiffness in the cells, times their volume fraction; it regularises tangents.
     fill, beside
         Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """
@@ -115,7 +114,7 @@ class GhostPenalty:
     def set_contents(
         self, own: NDArray[np.int64], volume: NDArray[np.float64], *moduli: NDArray[np.float64]
     ) -> NDArray[np.int64]:
-        """Set the volume fractions and moduli of the owned cells (n,) that contain material.
+        """Set the volume fractions and moduli of the cells `own` (n,), owned cells that contain material.
 
         Return all active local cells, ascending; volume (n,), m^d; moduli (n,): `modulus` and `shear` times volume.
         `fill` must be zero before the call.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides: penalties on the mean in each cell and, weaker, at points; see `held_cells`.
+"""Prescribed displacements of sides, by penalties on the mean in each cell and weaker ones at points; see `held_cells`.
 
-If a side lags behind its prescribed displacement, each cell and component gets a multiplier, by the method of
+If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
 multipliers (Hestenes 1969).  With multipliers the means are exact against any resistance of the body.
 """
 
@@ -38,7 +38,7 @@ from mpm_dolfinx.points.parts import Parts
 
 
 class HoldForms:
-    """Forms of the penalty: stiffness, and force towards the prescribed displacement, at points or for their means."""
+    """Forms of the penalty at points or for their means: stiffness, and force towards the prescribed displacement."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -81,7 +81,7 @@ class GivenDisplacements(Acting):
         self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
-        self._warned: set[int] = set()  # numbers of the conditions, for the log only
+        self._warned: set[int] = set()  # indices of the conditions with a warning in the log
         self._jumped: set[int] = set()  # likewise, for jumps at the start
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
@@ -124,7 +124,7 @@ class GivenDisplacements(Acting):
         """Return the penalties in a substep: one for each component and each cell or point."""
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
-        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty: zero displacement
+        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty if the displacement is zero
         held = HeldCells(self._grid, self._held_points(place, ends))
         placed, message = [], ""
         for axis in range(d):
@@ -145,7 +145,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on the sides, on the processes that own the cells of their rows.
+        """Return the integration points on sides, on the processes that own the cells whose constraints contain them.
 
         ends: start and end of the step, s, empty for zero displacement.
         """
@@ -197,7 +197,7 @@ class GivenDisplacements(Acting):
         return everywhere(self._grid, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return reactions with every component equal to `value`."""
+        """Return reactions, by quantity and name of the condition, with every component equal to `value`."""
         return {"reactions": {name: np.full(self._grid.dim, value) for name in self._names}}
 
     def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
@@ -356,7 +356,10 @@ class HoldLoads(Loads):
         return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return u with rigid motions of the parts that the conditions rotate; None if there is no such part."""
+        """Return an initial guess of u; None if the conditions rotate no connected part of the bodies.
+
+        Parts that the conditions rotate have their rigid motions, other parts the displacements `nodal`.
+        """
         grid = self.data.points.grid
         if grid.axisymmetric:
             return None
@@ -378,7 +381,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding error of nodal forces, with the penalty's: stiffness times the error of coordinates."""
+        """Return the rounding error of nodal forces; the penalty adds its stiffness times the error of coordinates."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

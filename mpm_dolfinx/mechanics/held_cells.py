@@ -3,8 +3,8 @@
 
 A Q1 field has too few nodal displacements in a cell to meet constraints at many points of a side. A stiff penalty at
 each point would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero mean
-in each cell. The present traction of the body, rotated with the side, is applied explicitly. Both penalties then bear
-the traction increment of the step only, and the gap between side and prescribed position is smaller by that factor.
+in each cell. The present traction of the body, rotated with the side, is applied explicitly. The penalties
+then bear only the traction increment of the step, and the gap between side and prescribed position is small.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ ALIGNED = 1e-2
 """Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
 EVERYWHERE = 1e2
 """Normal penalty stiffness at each point of a side with a slope below `ALIGNED`, in units of resistance / cell size.
-Halving this value changes the result of scene `soil` in tests/plateaus.py by 2.2e-05 (relative), doubling it by
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.2e-05 (relative), doubling it by
 1.7e-05, and finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor of a side's stress in the modulus of the penalty: a side buckles if its stress exceeds the penalty.  Halving
-this value changes the result of scene `soil` in tests/plateaus.py by 2.8e-06 (relative), doubling it by 4.7e-06, and
-finer cells by 3.0e-02.
+"""Factor on a side's stress in the modulus of the penalty, because a side buckles if its stress exceeds the penalty.
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
+4.7e-06, and finer cells by 3.0e-02.
 """
 CARRIED = 0.3  # largest plausible traction increment of a step / (resisting modulus and stress of the body)
 
@@ -62,11 +62,11 @@ def inner_cells(
     cell: NDArray[np.int32],
     normal: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return the local cells (n,) of the rows that constrain the points of sides.
+    """Return the local cells (n,) whose constraints contain the points of sides.
 
-    A flat side on a grid line is slightly wavy, so some of its cells are nearly empty. Their rows would contradict
-    those of the inner cells: only a large motion of the nodes beyond the line, which nothing resists, could satisfy
-    both. The inner cell therefore takes these points too (cell aggregation; Badia, Verdugo and Martin 2018).
+    A flat side on a grid line is slightly wavy, so some of its cells are nearly empty.  Their constraints would
+    contradict those of inner cells: only a large motion of nodes beyond the line, which nothing resists, could satisfy
+    both.  The inner cell therefore takes these points too (aggregation; Badia, Verdugo and Martin 2018).
 
     fill (cells,): volume fraction; sides: prescribed components and extent (d,), m, of the prescribed positions of each
     condition; number, cell, normal (n,), (n,), (n, d): condition, owned cell and outward area vector of each point.
@@ -86,7 +86,7 @@ def inner_cells(
 
 
 class HeldCells:
-    """Penalties of prescribed displacements: on means, one for each condition and cell, and then at points.
+    """Penalties of prescribed displacements: those on means, one for each condition and cell, then those at points.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ class HeldCells:
     Attributes
     ----------
     number, cell, x, shape, moments
-        Condition, cell, mean position, m, mean shape functions, and mean products of the distances from the cell's
-        midpoint, m, for each penalty.
+        Condition, cell, mean position, m, mean shape functions, mean products of offsets from the cell's midpoint, m,
+        of each penalty.
     stiffness, limit
         Penalty stiffness of each component, N/m, from the confined modulus along the normal of a side parallel to the
         grid.  Largest plausible force of each mean, N; larger forces are artefacts.
@@ -155,7 +155,7 @@ class HeldCells:
         self.way = np.diff(self._given.reshape(-1, 2, grid.dim), axis=1)[:, 0]
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
-        """Return the penalties on one component, with stiffness, gap and nodal fractions of the force.
+        """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
         Where a side meets a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. If a side moves at such a wall by more
@@ -219,7 +219,7 @@ class HeldCells:
     def beyond(
         self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the conditions whose force exceeds its limit, with the position (d,), m, of the largest excess.
+        """Return indices of conditions whose force exceeds its limit, and the position (d,), m, of each largest excess.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
         penalties then push the side to and fro. Only the sum of their forces at the nodes acts on the body and counts
@@ -228,7 +228,7 @@ class HeldCells:
         Parameters
         ----------
         row, axis, force : (k,)
-            Indices of penalties, components, and forces, N.
+            Penalty (its index), component (its axis), and force, N.
         told
             Indices of conditions that have been reported already; they are excluded.
         """

@@ -145,8 +145,8 @@ def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of their stress.
 
-    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D. The mean of C = F^T F at both ends is F^T F +
-    D^T D. Laws are evaluated at
+    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F at both ends is F^T F
+    + D^T D.  Laws are evaluated at
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
@@ -308,7 +308,7 @@ class Mass:
     def carried(
         self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], moved: NDArray[np.float64]
     ) -> dict[str, NDArray[np.float64]]:
-        """Return velocities and rates of F of the material points after a step.
+        """Return the point data `VELOCITY` and `RATE`, velocities and rates of F, after a step.
 
         Parameters
         ----------
@@ -423,10 +423,10 @@ class Flight(NamedTuple):
 
     start: PETSc.Vec  # velocities at the start of the step, m/s
     velocity: PETSc.Vec  # velocities after the last substep, m/s
-    acceleration: PETSc.Vec | None = None  # of the last substep, m/s^2
+    acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the inertial predictor of the next substep, m; own, before: weights of this and the last rate, s."""
+        """Return the inertial predictor of the next substep, m; own, before: weights of its and the last rate, s."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

@@ -8,7 +8,7 @@ Four volume constraints per cell suppress the bending modes of a Q1 quadrilatera
 
 The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a slice of the
 body. The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of several materials,
-materials that would not lock use F. The energy sum w psi(Fbar) / J_n has the derivative
+only the materials that would lock use Fbar. The energy sum w psi(Fbar) / J_n has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
@@ -92,7 +92,7 @@ class MeanDilatation:
         law
             Class of the part's law.
         points
-        Integration points of the part, with the field F (d, d): deformation gradient at the start of the step.
+            Integration points of the part, with the field F (d, d): deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
@@ -135,15 +135,14 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, the sums over all their parts, and their volumes with F-bar (cells, 1)."""
+        """Return the cells with F-bar, the sums over all parts in each, and its volume with F-bar (cells, 1)."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In 2D a law without an energy is differentiated with respect to Fbar only, which takes half of the time. With
-        Fbar = s F
-        = s F
+        In 2D a law without an energy is differentiated with respect to Fbar only, which takes half of the time.  With
+        Fbar = s F,
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
@@ -181,7 +180,10 @@ class MeanDilatation:
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f to the mean of a quantity over the pieces with F-bar in each cell; sums: functions of each part."""
+        """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
+
+        sums: one function for each part of the scene's points; it returns the sums of this part in the cells.
+        """
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
@@ -268,14 +270,14 @@ class StressAtPoints:
 
 
 class Cells:
-    """Cells of several parts; filled: all of them; where: indices of each part's cells in `filled`."""
+    """Cells that contain any of several parts; filled: these cells; where: indices of each part's cells in `filled`."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) of the parts' values."""
+        """Return the sums over the parts (cells, quantities) in the cells `filled`; values: one array for each part."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

@@ -6,9 +6,8 @@ derivative of
 
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
 
-that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions. P' is the first
-Piola-Kirchhoff effective stress relative to the start of the step. A law may define the stress instead of psi. UFL
-computes the derivatives.
+that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions.  P' is the first
+Piola-Kirchhoff effective stress relative to the start of the step.  A law may define the stress instead of psi.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class MomentumForms:
         """Forms of inertia, None in a scene without inertia."""
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
         self._of_suction = OfSuction(grid, self.dilatation) if dried else None
-        self._local: dict[int, LocalUnknowns] = {}  # by index of the part
+        self._local: dict[int, LocalUnknowns] = {}  # by index of the part of the points
         made = []
         for number, (law, points, locks) in enumerate(laws):
             given = by_scene(grid, None, law, points) | {"dt": dt}
@@ -118,7 +117,7 @@ class MomentumForms:
         self.linear = not averaged and all(law.linear for law, *_ in laws)
         """Whether the tangent of the laws depends only on the positions of the points."""
         self.elastic = not any(law.state for law, *_ in laws)
-        """Whether no law has a state: in yielding soil the tangent of one substep is wrong for the next."""
+        """Whether no law has a state; only then does the tangent of one substep suit the next."""
         self.ghost = GhostPenalty(grid, V, at_points)
         kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *rooms)]
         self.active = Active(grid, pressure is not None, *kept)
@@ -134,7 +133,7 @@ class MomentumForms:
         symmetric: bool,
         given: Mapping[str, fem.Constant],
     ) -> tuple[ElementForces, ElementMatrices | StackedElementMatrices]:
-        """Return the compiled residual and tangent of the integration points of a law."""
+        """Return the compiled residual and tangent of a law at its integration points."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
         p = None
@@ -224,7 +223,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return sums (nodes,) of values (cells,), or (cells, 2^d) at their nodes, of owned cells of all processes."""
+        """Return the sums (nodes,) over the cells at each node; values of owned cells (cells,), or of their nodes."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
         nodes = self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
@@ -292,7 +291,7 @@ class MomentumSystem:
         self._forms, d = forms, forms.grid.dim
         self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
         self.locks = forms.dilatation is not None
-        """Whether some law uses F-bar: soil that yields or is nearly incompressible."""
+        """Whether some law uses F-bar, because the soil yields or is nearly incompressible."""
         active = forms.active.now.dofs
         self.touched = active[active < d * forms.u.function_space.dofmap.index_map.size_local]
         """Owned degrees of freedom of active cells, fixed or free."""
@@ -304,7 +303,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """Rounding error of a connected part if all its unknowns had the error of this unknown, N."""
+        """Norm of the rounding errors in a connected part, N, if all its unknowns had the error of this unknown."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = np.setdiff1d(active, dofs)
@@ -316,7 +315,7 @@ class MomentumSystem:
         at_walls[held // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
         self._ghost = forms.ghost.on(facets, facets[near])
-        self.firm, self._firmness = None, None  # for scenes without yielding
+        self.firm, self._firmness = None, None  # None in scenes without yielding
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
 
@@ -498,7 +497,7 @@ class MomentumProblem:
     def powers(self) -> dict[str, float]:
         """Return the powers at u of stresses, viscous resistance, friction and external loads of this process, W."""
         forms, unknowns = self.forms, self.system.unknowns
-        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # zero at fixed nodes
+        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # fixed nodes have no velocity
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
         out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "friction": 0.0}
         out["external"] = 0.0
@@ -520,11 +519,11 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return relative residuals of the connected parts, first without rounding errors, then in full.
+        """Return two relative residuals of each connected part: without rounding errors, and with them.
 
         r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node,
-        unless `first`: one solve is made even for a load below the rounding error.  The second result uses scales of
-        at least the rounding error divided by the tolerance.
+        unless `first` is set, so that one solve is made even for a load below the rounding error.  The second result
+        uses scales of at least the rounding error divided by the tolerance.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
@@ -568,7 +567,7 @@ class MomentumProblem:
         data: integration points, by default the problem's; firmness: fraction, one number or one per connected part.
         """
         K = self.system.K
-        # the first sum gives K its full sparsity pattern: PETSc does not always notice a later change
+        # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change
         first = not K.assembled
         zero(K)
         self.forms.assemble_tangent(K, data or self.data)

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""Weight of the corner-based volume ratio of a cell at the start of a step, in units of G / (lambda + 2G), at most 1.
+"""Weight of the corner-based volume ratio J_n of a cell (`cell_ratios`), in units of G / (lambda + 2G), at most 1.
 
 The incremental volume ratio of the points has the remaining weight. With nu = 0.4999 and a weight of 1, the stress
 change at a reset of the grid would exceed the stresses in the bodies.
@@ -32,8 +32,8 @@ STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 at 0.47.
 
 The difference between corner-based ratio and Q1 field expels water from such skeletons in every step of any length.
-With a weight of 1 and eight cells over the depth, extreme pressures of a beam have errors of 43 % at nu = 0.49. At
-0.499 the pressures are six to thirty times too large, and adaptive steps never grow.
+With a weight of 1 and eight cells across its depth, the extreme pressures of a beam have errors of 43 % at nu = 0.49.
+At 0.499 the pressures are six to thirty times too large, and adaptive steps never grow.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
@@ -54,7 +54,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step, in all and for each part of the points: see `SceneMaterials.parts`."""
+    """Integration points of a step: of all points, and of each part of the points, see `SceneMaterials.parts`."""
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
@@ -62,7 +62,7 @@ class QuadratureData:
     of_points: PointData  # all, with the volumes and F of the points in place of F-bar's, for user-defined terms
 
     def shape_gradients(self) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the points at which laws use them."""
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the positions where laws use them."""
         if self.parts[0] is self.pieces:
             return self.pieces.places.shape_gradients(slice(None))
         n, d = self.pieces.x.shape
@@ -261,7 +261,7 @@ class QuadraturePoints:
         return self._scene.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return a key (m, 2) for each integration point; equal keys mean equal conductivities."""
+        """Return two numbers (m, 2) for each integration point, equal for points that conduct alike."""
         return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:

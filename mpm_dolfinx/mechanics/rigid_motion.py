@@ -38,7 +38,7 @@ def rigid_motion(
     x : (n, d), m
         The positions.
     counts : (m,)
-        Penalties that are used.
+        Whether each penalty is used.
 
     Returns
     -------

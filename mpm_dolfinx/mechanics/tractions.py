@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-A traction, force per reference area, is int t . v dA on the reference faces. A pressure is -int p n . v da over the
-present area, with its tangent. The tangent is symmetric except for the edges dx of the surface, which contribute
-p/2 (v x du) . dx. This term vanishes where two surfaces of equal pressure meet. It also vanishes on a wall that fixes
-the normal component of v and du, because v, du and the edge lie in the wall.
+The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. That of a pressure
+is -int p n . v da on the present area. The tangent of this term is symmetric except for the edges dx of the surface,
+which contribute p/2 (v x du) . dx. This contribution vanishes where two surfaces of equal pressure meet. It also
+vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
 
 
 class PressureForms:
-    """Forms of pressures: nodal forces, and minus their derivative, from the force on the area at the step's start."""
+    """Forms of nodal forces and minus their derivative, from a pressure force on the area at the step's start."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -231,4 +231,4 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
 
 
 _EDGES = {2: np.array([[0], [1]]), 3: np.array([[0, 1], [1, 3], [3, 2], [2, 0]])}
-"""Indices of the two corners of each edge of a face in 3D; in 2D of the ends of a face."""
+"""Indices of the two corners of each edge of a face in 3D, and of each end of a face in 2D."""

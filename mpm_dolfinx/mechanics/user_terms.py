@@ -25,7 +25,7 @@ from mpm_dolfinx.materials.user_functions import compiling, term_of
 class OwnTerm(NamedTuple):
     """A user-defined term."""
 
-    given: Callable | OnSide  # its definition
+    given: Callable | OnSide  # definition of the term by the user
     points: FormPoints  # integration points
     form: PointForm
     slope: PointForm | None  # derivative with respect to u, None if zero

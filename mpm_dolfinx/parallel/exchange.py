@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Exchange of array rows between processes, and of answers to them.
+"""Exchange of array rows between processes, and of the answers to these rows.
 
 A row is the data of one piece of a particle domain, corner or loaded point.  It is sent to the process that owns its
 cell, which assembles the integrals of the cell.  A single process copies nothing.
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @dataclass
 class Traffic:
-    """Totals of exchanges from this process to others: transfers, non-empty messages, bytes."""
+    """Total numbers of transfers, non-empty messages and bytes that this process has sent to others."""
 
     transfers: int = 0
     messages: int = 0

@@ -14,7 +14,7 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages with frames that are not a user's script: a warning names the line of the script."""
+"""Packages whose frames a warning skips, because it names a line of the user's script."""
 
 
 class ResultWarning(UserWarning):
@@ -69,7 +69,7 @@ def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *valu
     raised = None
     if comm.rank == 0:
         try:
-            with tqdm.external_write_mode(sys.stderr):  # prints above the progress bar
+            with tqdm.external_write_mode(sys.stderr):  # prints the message above the progress bar
                 warnings.warn(message % values, category, stacklevel=_outside())
         except Warning as error:
             raised = error

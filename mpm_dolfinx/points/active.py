@@ -42,7 +42,7 @@ class ActiveSet:
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Connected part (cells,) of each local cell, from 1, 0 for empty cells; and the number of parts."""
+        """Connected part (cells,) of each local cell (1, 2, ...; 0 for empty cells), and the number of parts."""
         return parts_of_cells(self.grid, self.contains)
 
 
@@ -56,7 +56,7 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Local arrays for cells and for unrolled degrees of freedom; they are zero outside active cells.
+        Arrays over the local cells, and over the unrolled local degrees of freedom, that `clear` resets to zero.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Active:
     slot : (cells,)
         Index of each cell among the owned active cells.
     centroid, opening : (cells, d), (cells, d, 2)
-        Offsets of the material's centroids from the cells' midpoints, m; open fractions of faces.  Empty without fluid.
+        Offset, m, of the material's centroid from the midpoint; open fractions of faces. Empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):
@@ -79,7 +79,7 @@ class Active:
         self._of_dofs = tuple(dofs)
 
     def clear(self) -> None:
-        """Reset the arrays to zero; called before other cells become active."""
+        """Reset the arrays `cells` and `dofs` to zero; called before other cells become active."""
         for rows, arrays in ((self.now.cells, self._of_cells), (self.now.dofs, self._of_dofs)):
             for values in arrays:
                 values[rows] = 0.0

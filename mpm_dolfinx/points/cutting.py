@@ -5,10 +5,10 @@ A material point has a quadrilateral or hexahedral domain with tracked corners. 
 centroids, in 3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear.
 One quadrature point per piece therefore integrates these gradients exactly, wherever the domain lies on the grid.
 
-The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face. The triangles match the
-neighbours' and prefer no diagonal. The grid planes, axis by axis, slice this surface. Gauss's theorem gives volumes and
-first moments, from a slice to the lower face of its cell, and in the column of cells below. The interior of a domain is
-never cut, and the faces of the pieces follow at no cost.
+The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  They match the triangles of
+the neighbours, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives the
+volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
+interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
 
 In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
 (Pappus). Gradients are evaluated at the volume's centroid, (mean r^2 / r_c, mean r z / r_c). The hoop strain u_r / r is
@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
-TANGLED = 0.2  # volume between the corners / volume of the domain; below it corners are re-initialised from F
+TANGLED = 0.2  # least (volume between the corners) / (volume of the domain); else corners are re-initialised from F
 
 
 @dataclass
@@ -68,7 +68,7 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Indices (2d, 2^(d-1)) of the corners of a domain's faces."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of the faces with corners in this order: 1 outward, -1 inward; the first four in 2D."""
+"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
@@ -168,7 +168,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains are inverted: the volume between their corners is far below, or above, their volume (n,)."""
+    """Return which domains are inverted: the volume between the corners is far from their `volume` (n,)."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -219,7 +219,7 @@ def on_planes(
     Parameters
     ----------
     true, x, axes
-        Positions from the grid's lower corner, in cells; positions from the base, m; array axis of the components.
+        Positions from the grid's lower corner, in cells; the same from the base, m; array axis of components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -489,8 +489,7 @@ def _products(
     pairs
         Axes of the two coordinates, ascending.
     x, sums, area
-        Vertices (d, d, m) of slices, their sums (d, m), and the areas (m,) of the slices projected along the first
-        axis.
+        Vertices (d, d, m) of slices, their sums (d, m), and areas (m,) of slices, projected along the first axis.
     pair, total
         Functions: sum over the vertices of slices of the product of two coordinates; sum of slice values in each slot.
     """
@@ -576,7 +575,7 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the parts of cut triangles as triangles that do not depend on the order of the axes.
+    """Return the parts of cut triangles, divided into triangles that do not depend on the order of the axes.
 
     The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
@@ -594,7 +593,7 @@ def _polygons(
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
-    near = grid.snap.max()  # within which corners lie on planes
+    near = grid.snap.max()  # corners nearer to a plane lie on it
     two = slice(-3, -1)  # two barycentric coordinates, from which areas are computed
     middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
     order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
@@ -623,7 +622,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the next member (n,) of each member's group, cyclically; group (n,): group of each member, in order."""
+    """Return the next member (n,) in its group after each member, cyclically; group (n,): group of each, ascending."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after

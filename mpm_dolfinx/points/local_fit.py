@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Values at given positions from polynomials fitted to surrounding data: moving least squares.
+"""Values at given positions from polynomials that are fitted to surrounding data (moving least squares).
 
     sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i: offsets from the position.
 
-The value is the constant of P (Lancaster and Salkauskas 1981). Polynomials up to the degree are reproduced exactly. The
+The value is the constant term of P (Lancaster and Salkauskas 1981). Polynomials up to the degree of P are exact. The
 weights decrease smoothly to zero, so values are continuous when data enter or leave the fit. The small terms set
 coefficients to zero that the data do not determine, the higher degrees first.
 """
@@ -23,10 +23,10 @@ from mpm_dolfinx.parallel.exchange import over_all
 RADIUS = 3.0
 """Offset beyond which the weight is zero, in spacings of the data.
 
-Source: exact, at an end of the data the points at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
+Source: exact, because at an end of the data the points at 0.5, 1.5 and 2.5 have weight, as many as a parabola needs.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of each degree's coefficients relative to the data's weight; they only affect undetermined coefficients.
+"""Weights of the coefficients of degrees 0, 1, 2, relative to the data; they affect only undetermined coefficients.
 
 Factors of 0.01 and 100 change the pressures of a consolidating column by 1e-5 of the load.
 """

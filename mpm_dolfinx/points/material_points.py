@@ -20,13 +20,13 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import centroids
 
 ACROSS = "stretch across"
-"""Name of the out-of-plane stretch of points in plane strain, for laws with F-bar along all three axes."""
+"""Name of the data with the out-of-plane stretch in plane strain, for laws with F-bar along all three axes."""
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the body (n,) of each point, from its id; starts (bodies + 1,): first id of each body and of new points.
+    """Return the body (n,) of each point by its id; starts (bodies + 1,): first id of each body, and of renewed points.
 
-    Ids of new points are assigned to the bodies in turn.
+    Ids of renewed points belong to the bodies in turn.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
@@ -96,10 +96,9 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: mean over the domain, second-order accurate. Cells and pieces have
-        their own pressures.
+        Pore pressure, positive in compression: mean over the domain, of second order. Cells and pieces have their own.
     x : (n, d), m
-        Centroid of the domain, in axisymmetry of its section: for linear fields, F and pressure are exact at it.
+        Centroid of the domain, in axisymmetry of its section. F and pressure are exact there for linear fields.
     origin : (n, 2^d, d), m
         Corners at zero displacement: as seeded, or at the last time a stage set displacements to zero.
     reference : (n, 2^d, d), m
@@ -185,7 +184,7 @@ class MaterialPoints:
     def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
         """Return points with a function applied to each array: a selection, a copy, or a transfer of its entries.
 
-        Fields with a common array have a common array again.
+        Fields that share an array share the new array too.
         """
         cache: dict[int, NDArray] = {}
 

@@ -74,7 +74,7 @@ class OfParts:
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return norms / scales; 0 where a norm is at most `round_off`, and inf in place of nan, for comparisons."""
+    """Return norms / scales, but 0 where a norm is at most `round_off`, and inf instead of nan, for comparisons."""
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -144,10 +144,10 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the parts of cells over all processes, and their number.
+    """Return for each cell the number of its connected part, counted over all processes, and the number of parts.
 
-    own: part of each cell on this process; count: number of these parts; nodes (n,): local numbers of the cells' nodes;
-    of_node (n,): part of each node on this process.
+    own, count: part of each cell, and number of parts, counted on this process alone; nodes, of_node (n,): local
+    numbers of the cells' nodes, and part of each node on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

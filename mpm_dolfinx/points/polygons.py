@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NONE = -1
-"""Edge number of edges without a number."""
+"""Value in `Polygons.edge` for edges without a number."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Polygons:
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
         """Divide convex polygons into quadrilaterals, by the diagonals that divide the area most evenly.
 
-        The result therefore prefers no vertex and no direction.
+        The result therefore does not depend on the first vertex or the direction.
 
         Returns
         -------
@@ -123,7 +123,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Cut a quadrilateral, or from pentagons a triangle, off polygons with n > 4 vertices; return both parts."""
+        """Cut a quadrilateral off each polygon with n > 4 vertices, a triangle off pentagons; return both parts."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
@@ -150,7 +150,7 @@ class Polygons:
         return np.concatenate([x[:, :1], middle, x[:, 1:]], axis=1), edge[:, [0, 0, 1, 2]]
 
     def _joined(self, other: Polygons) -> Polygons:
-        """Return these polygons and others, which have no more vertices."""
+        """Return these polygons, then `other`, whose arrays have at most as many vertices per polygon as these."""
         more = self.x.shape[1] - other.x.shape[1]
         x = np.concatenate([self.x, np.pad(other.x, ((0, 0), (0, more), (0, 0)), mode="edge")])
         edge = np.concatenate([self.edge, np.pad(other.edge, ((0, 0), (0, more)), constant_values=NONE)])

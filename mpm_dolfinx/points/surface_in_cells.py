@@ -12,7 +12,7 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
 """Number of surface edges in a cell with renewed particle domains.  Halving this value changes the result of scene
-`flow` in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
+"flow" in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
 """Deviation of the surface from a chord, in cells, above which it has a corner; flatter parts are divided evenly.
@@ -79,7 +79,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return region (m,) and corners (m, 4, 2) of each new domain, and which of its faces (m, 4) are surface."""
+        """Return the region (m,) and corners (m, 4, 2) of each new domain, and whether each face (m, 4) is surface."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -102,11 +102,11 @@ class Region:
 def resampled(
     of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return surfaces as vertices (n, EDGES + 1, 2) from P to Q (n, 2), at even distances between corners.
+    """Return the surface in each cell as vertices (n, EDGES + 1, 2) from P to Q (n, 2), evenly spaced between corners.
 
     The area between surface and chord is preserved: vertices are shifted to restore the lost area.
 
-    of (m,), x (m, 2, 2): surface of each segment, in order, and the segment's ends.
+    of (m,), x (m, 2, 2): cell of each segment of the given surfaces, in order, and the ends of the segment.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])
@@ -131,7 +131,7 @@ def resampled(
         target = (at[:, low] + at[:, high]) / 2
         target = np.where(far[corner] > BENT, arc[corner], target)
         at[:, middle] = target
-        out[:, middle] = (place(target - NEAR) + place(target + NEAR)) / 2  # alike from both ends
+        out[:, middle] = (place(target - NEAR) + place(target + NEAR)) / 2  # the same result from both ends
 
     def place(target: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the positions (n, 2), in cells, at arc lengths `target` (n,) along the segments."""

@@ -27,7 +27,7 @@ MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (
 class PoreWater:
     """Water storage of m pieces of particle domains in n cells."""
 
-    # function of pressures (m,), Pa: S, dS/dp (m,), 1/Pa, and maybe more
+    # function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and maybe more
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
     slot: NDArray[np.int64]  # (m,) cell of each piece
     store: NDArray[np.float64]  # (m,) storage, m^d/Pa
@@ -57,7 +57,7 @@ class PoreWater:
         Parameters
         ----------
         p : (n,), Pa
-            Initial values; they are returned if their contents are right.
+            Initial values; they are returned if the cells then have the given contents.
         offset : (m,), Pa
             Pressures of the pieces minus pressures of their cells.
         """

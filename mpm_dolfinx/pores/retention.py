@@ -250,9 +250,9 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of the materials, as UFL expressions of data at the integration points.
 
-    The points' field `retention` is a vector: the law's kind, from 1, and its constants; 0 if pores stay saturated.
-    Pieces also have the field `lever`, the vector from the centroid of the material in their cell.  The pressure in a
-    piece is the cell pressure plus the hydrostatic difference over `lever`.
+    The points' field `retention` is a vector: the number of the law's class (1, 2, ...), then its constants.  The
+    number is 0 if the pores stay saturated.  Pieces also have the field `lever`, the vector from the centroid of the
+    material in their cell.  The pressure in a piece is the cell pressure plus the hydrostatic difference over `lever`.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ class Retentions:
         return out
 
     def number(self, law) -> int:
-        """Return the number of a law among all laws, from 1; 0 for None."""
+        """Return the number of a law among all laws (1, 2, ...); 0 for None."""
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -295,11 +295,11 @@ class Retentions:
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
-        """Return the pressures of integration points, Pa, as UFL; p: pressures of their cells, Pa."""
+        """Return the pressures of integration points, Pa, as UFL; p: pressures of the points' cells, Pa."""
         return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
 
     def of(self, name: str, p, points: FormPoints):
-        """Return a property of the pores at integration points as UFL; p: pressures of their cells, Pa.
+        """Return a property of the pores at integration points as UFL; p: pressures of the points' cells, Pa.
 
         Parameters
         ----------
@@ -427,7 +427,7 @@ class Conductance:
         z = z - i
         a, b = self._phi[i], self._phi[i + 1]
         c, d = self._slope[i], self._slope[i + 1]
-        # a cubic in z from the lower row: a + c z + e z^2 + f z^3
+        # the cubic a + c z + e z^2 + f z^3 in the distance z from the lower row
         e, f = 3 * (b - a) - 2 * c - d, 2 * (a - b) + c + d
         phi = a + z * (c + z * (e + z * f))
         first, second = c + z * (2 * e + 3 * z * f), 2 * e + 6 * z * f
@@ -441,13 +441,13 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of suctions in the table / law's scale.  Source: exact beyond the range, up to a fraction as small."""
+"""Range of suctions in the table, divided by the law's scale.  Source: beyond it exact up to a fraction of 1e-8."""
 ROWS = 4000
-"""Number of tabulated suctions.  Halving this value changes the result of scene `dry` in tests/plateaus.py by 2.1e-08
+"""Number of tabulated suctions.  Halving this value changes the result of scene "dry" in tests/plateaus.py by 2.1e-08
 (relative), doubling it by 2.6e-09, and finer cells by 6.6e-03.
 """
 GAUSS = 8
-"""Quadrature points between two tabulated suctions.  Halving this value changes the result of scene `dry` in
+"""Quadrature points between two tabulated suctions.  Halving this value changes the result of scene "dry" in
 tests/plateaus.py by 8.2e-10 (relative), doubling it by 1.5e-09, and finer cells by 6.6e-03.
 """
 
@@ -465,10 +465,10 @@ def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[n
 FARTHEST = np.log(10)
 """Largest change of the suction's logarithm in a Newton step; without a limit, fronts in dry soil do not converge.
 
-Celia's column of 25 and 100 cells, 28 time steps: 310 and 500 Newton steps with a limit of 2; with a limit of 4, 330
-and 920, and four time steps are reduced.
+Celia's column of 25 and 100 cells takes 310 and 500 Newton steps in 28 time steps with a limit of 2.  With a limit of
+4 it takes 330 and 920, and four time steps are reduced.
 
-Halving this value changes the result of scene `dry` in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
+Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
 and finer cells by 6.6e-03.
 """
 

@@ -46,7 +46,7 @@ class _Lattice:
 
     number (m, cells): lexicographic numbers, -1 outside the grid; midpoint, size (m, cells, d), m.
     middle: index of the probe's cell in its block; stride (d,): increment of this index along each axis.
-    neighbours: for each axis and end, the cells that have a neighbour there, and these neighbours.
+    neighbours: for each axis and end, indices in the block of cells with a neighbour there, and of these neighbours.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -73,7 +73,7 @@ class _Lattice:
 class _Around:
     """Data of the cells around m probes, equal on every process; arrays (m, cells, ...).
 
-    p, Pa; centroid (d,), m, from the probe; half (d,), m: centroid from the cell's midpoint.
+    p: pressure, Pa; centroid (d,), m: vector from the probe; half (d,), m: vector from the cell's midpoint to it.
     open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: see `_connected`.
     """
 
@@ -107,8 +107,7 @@ class _Around:
         """Return the local numbers (m, cells) of owned cells, -1 for others, and the data of all cells.
 
         p: pressures of the filled owned cells, Pa; soils (k, 3): conductivity, its law and material of the pieces.
-        Columns of the data: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan if the pieces of a cell
-        differ), open fractions.
+        Data columns: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan for several), open fractions.
         """
         grid = self._grid
         contents = self._contents
@@ -117,7 +116,7 @@ class _Around:
         mobility = on_grid.resting_mobility()
         slot = contents.slot(on_grid.cut.cells)
         held = np.zeros((len(filled), 3))
-        held[slot] = soils  # of any piece in the cell
+        held[slot] = soils  # soil of any one piece in the cell
         held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (soils != held[slot]).T], axis=1)] = np.nan
         one = np.ones((len(filled), grid.dim))
         kappa = mobility.mean[:, None] * (one if mobility.share is None else mobility.share)
@@ -126,7 +125,7 @@ class _Around:
         rows = np.column_stack([one[:, 0], p, contents.centroid[filled], kappa, shift, held, share])
         local = np.where(number >= 0, grid.local(np.maximum(number, 0)), -1)
         local[local >= grid.num_owned] = -1
-        own = local >= 0  # may be empty
+        own = local >= 0  # a cell of this process may be empty
         local[own] = np.where(on_grid.active.contains[local[own]], local[own], -1)
         out, (probe, place) = np.zeros((*local.shape, rows.shape[1])), np.nonzero(local >= 0)
         out[probe, place] = rows[contents.slot(local[probe, place])]
@@ -183,7 +182,7 @@ class _Around:
         return np.clip(base + fit.values(comm)[:, 0], low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return bounds (m,) of the head, Pa: heads of cell and neighbours, extrapolated to an undrained side."""
+        """Return the lower and upper bound (m,) of the heads, Pa, from the cell and its neighbours; see the module."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
@@ -231,7 +230,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return probes, offsets, heads and weights at drained sides in the fit, and whether in the probe's cell.
+        """Return probes, offsets, heads and weights at drained sides in the fit, and which are in the probe's cell.
 
         Each side of a cell gives the fit one head, the mean over its faces. Separate heads would cause false gradients.
         """

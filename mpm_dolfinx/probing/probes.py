@@ -55,7 +55,7 @@ class Probes:
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values (m, ...) of all probes on every process; here, values: of the probes on this process."""
+        """Return the values (m, ...) of all probes on every process, from the `values` of the `known` ones on this."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
@@ -94,7 +94,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     Parameters
     ----------
     bodies
-        All bodies of the scene, in the same order.
+        All bodies, in the order in which the scene lists them.
     x0 : (m, d), m
         Reference positions, before the map of `mapped`, inside or on the surface of the bodies.  A probe on a common
         surface of two bodies belongs to the first; move the position slightly to select the other.
@@ -110,7 +110,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     flag("probes: stress", stress)
     x0 = positions(x0, bodies[0].dim)
     ids, xi = np.empty(len(x0), dtype=np.int64), np.empty(x0.shape)
-    for i, x in enumerate(x0):  # few positions, once for a scene
+    for i, x in enumerate(x0):  # a loop suffices for few positions, once for a scene
         found = next(_domains_at(bodies, x, rounding(x0)), None)
         if found is None:
             raise ValueError(f"probe at {x}: outside the bodies, must be in one or on its surface")

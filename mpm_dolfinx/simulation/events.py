@@ -41,7 +41,7 @@ class Step(NamedTuple):
 
     start: State  # state at the start
     dt: float  # length of the step, s
-    how: tuple  # substeps, if they differ from the scene's
+    how: tuple  # substeps, if they differ from those of the scene
 
 
 class Found(NamedTuple):
@@ -50,7 +50,7 @@ class Found(NamedTuple):
     number: int  # index of its function
     dt: float  # time from the start of the step, s
     new: State  # state at the event
-    report: Report  # of the step to the event
+    report: Report  # report of the step to the event
 
 
 class Events:
@@ -80,9 +80,9 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`; None without an event.
 
-        Trial steps of other lengths start from the same state: by Brent's method for numbers, by bisection for
-        booleans. The result is the first of their states after the event, at most the fraction `LOCATED` of the step
-        later. The simulation then has the state at the start of the step again, even after an error.
+        Trial steps start from the same state. Brent's method chooses their lengths for numbers, bisection for booleans.
+        The result is the first state that they find after the event, at most the fraction `LOCATED` of the step later.
+        The simulation then has the state at the start of the step again, even after an error.
         """
         if not self._until:
             return None
@@ -106,7 +106,7 @@ class Events:
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
         end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
         self._simulation.state = step.start
-        new, report = self._simulation.advanced(end, *step.how)  # again: the scene keeps data of its last step
+        new, report = self._simulation.advanced(end, *step.how)  # repeated: the scene keeps data of its last step
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:

@@ -193,7 +193,7 @@ class Simulation:
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero for free components.
 
-        At a node where two walls fix the same component, it counts for the wall normal to it, else half for each.
+        Where two walls fix a component, the wall normal to it has the whole force; if neither is normal, each has half.
         """
         return self.outcome("wall_reactions")
 
@@ -263,8 +263,8 @@ class Simulation:
     ) -> None:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        Stresses and pressures are unchanged. The next `run` finds the new equilibrium: in its first step, or gradually
-        under loads that vary with time.
+        Stresses and pressures are unchanged. The next `run` finds the new equilibrium at once, or gradually under
+        varying loads.
 
         Parameters
         ----------
@@ -274,15 +274,15 @@ class Simulation:
             Whether bodies have inertia from now on; only if the scene allows it. Bodies then start without velocity.
         conditions
             All conditions from now on; by default the present ones. `[*simulation.conditions, more]` adds one. Every
-            `Contact` remains, whether listed or not.
+            `Contact` remains in force, whether it is listed or not.
         add
             Indices of bodies in `later`: a fill, without velocity and stress. It is placed on the present surface of
             the bodies that it touched when seeded; its opposite side remains at its seeded position.
         remove
             Indices of bodies to be removed: an excavation.
         reset_displacement
-            Whether displacements are measured from the present positions. Conditions that remain are unchanged: a
-            `Displacement` then also starts from the present positions, and moves its side once more.
+            Whether displacements are measured from the present positions. Conditions are not adapted: a remaining
+            `Displacement` of value d is then measured from there too, so it moves its side by d again.
         fields
             New values of entries of `points.data`, (n, ...) at this process's points, or one for all points: constants
             of materials that vary with position, state of laws, or new data of the user, which the points then store.
@@ -310,13 +310,13 @@ class Simulation:
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; `state` is unchanged; how: other substeps."""
+        """Return the state after a step of dt, s, and its report; `state` is unchanged; how: substeps to be used."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
             return step(self.scene, self.state, dt, *how)
         except StepFailed:
             raise
-        except BaseException as error:  # interrupted anywhere
+        except BaseException as error:  # the step may have been interrupted anywhere
             self.scene.forget()
             raise_interrupt(error)
             raise

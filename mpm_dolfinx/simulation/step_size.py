@@ -25,27 +25,27 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.step_memory import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Smallest reduced step relative to the nominal step: for equal steps, for adaptive steps.
+"""Smallest reduced step / nominal step, for equal steps and for adaptive steps.
 
 Adaptive steps grow over decades. At the onset of sliding they must shrink to the time scale of sliding.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step relative to the time; at a singularity in time steps would become ever smaller.
+"""Smallest adaptive step / time; without it, steps would become ever smaller at a singularity in time.
 
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""The next adaptive step is SAFETY / (a root of the relative error), in SHRINKS to GROWS; below KEEPS it is unchanged.
+"""The next / the last adaptive step: SAFETY / (a root of the relative error), within SHRINKS and GROWS; 1 below KEEPS.
 
 Source: Hairer, Norsett and Wanner (1993), eq. 4.13; the last Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden pressure change, relative to the largest change so far, above which two halves replace a step.
+"""Sudden pressure change / largest change so far, above which two steps of half the length replace a step.
 
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""Ratio of sudden changes in successive steps, at equal rates, up to which a change is no jump."""
+"""Ratio of the sudden changes of successive steps, per step length, up to which a change is no jump."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
@@ -64,7 +64,7 @@ class StepSize:
         First step; length of equal steps, or of the longest adaptive step.
     rtol
         Tolerance of the pressure error, relative to the largest pressure change since the start of the run, or to the
-        undrained pressure change of the step if that is larger; None: equal steps.
+        undrained pressure change of the step if that is larger; None for equal steps.
     """
 
     first: float
@@ -100,7 +100,7 @@ class StepSize:
     def refused(self, size: float, report: Report, control: StepControl) -> float:
         """Return the factor by which a solved step must be reduced to meet the error tolerance; 1 if it is accepted.
 
-        After a jump of the loads one long step overshoots by up to a fifth of the remaining change. Two halves do not.
+        After a jump of the loads one step overshoots by up to a fifth of the remaining change; two half steps do not.
         """
         if not self.by_error:
             return 0.5 if size > 0.75 * self.longest and self._rings(size, report, control) else 1.0
@@ -136,7 +136,7 @@ class StepSize:
         if self.by_error:
             return replace(control, small=small)
         waits = control.waits // 2 if whole and control.kept == 0 else control.waits
-        if small > (1 + SAME) * control.small and control.kept > waits:  # beyond rounding
+        if small > (1 + SAME) * control.small and control.kept > waits:  # by more than rounding
             return replace(control, small=small, waits=waits, kept=0)
         # a step shortened for an output is no evidence about longer steps
         return replace(control, waits=waits, kept=control.kept + whole)
@@ -158,8 +158,8 @@ class StepSize:
         """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content.
 
         The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
-        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent, does
-        not fall with the step.
+        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent,
+        remains.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
@@ -287,7 +287,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
-    if inertia:  # for release or sudden loading
+    if inertia:  # bodies may be released or loaded suddenly
         first = min(first, cell_time(scene, points))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))

@@ -5,8 +5,8 @@ A factor F divides cohesion, tensile strength and the tangents of the angles of 
 Lane 1999). Dilation is divided too, so that associated flow stays associated. Soil that is too weak has no equilibrium,
 but a failure of the solver is no proof that the soil is too weak. Each trial therefore adds a viscous stress and
 follows the motion in time. The criterion is the overload: viscous stress / shear stress in the moving soil. If a body
-comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload remains: it is the
-missing strength, at any viscosity and cell size.
+comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload remains, equal to
+the missing strength, at any viscosity and cell size.
 
 All trials start from the stresses of soil with unlimited strength. Bodies in equilibrium have such stresses. Bodies
 that cannot stand, and were therefore not run, reach them in an elastic step.
@@ -45,19 +45,19 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors until bodies rest at one and slide at another; largest, or 1 / smallest, factor."""
+"""Ratio of successive trial factors until bodies rest at one and slide at another; largest factor, 1 / smallest."""
 LACKS = 0.25
-"""Largest overload of a trial that comes to rest / `rtol`.
+"""Largest overload, divided by `rtol`, of a trial that comes to rest.
 
 A trial that slides starts with an overload of 0.9 of the missing strength in a uniform block, and of 0.6 in a slope.
-The overload halves until the end. With 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
+By the end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide / elastic strain at yield, or / overload if the overload is smaller.
+"""Strain in a trial of a marginal slide, divided by the elastic strain at yield, or by a smaller overload.
 
-Stresses of soil that begins to flow redistribute within a few strains at yield. In soft soil such strains would change
-the shape of the body; the viscosity is larger there. Half and twice this number change the factor of a slope by 0.5 %,
-twice the number of steps changes it by less than 0.1 %.
+Stresses of soil that begins to flow redistribute within a few strains at yield.  In soft soil such strains would change
+the shape of the body, so the viscosity is larger there.  Half and twice this number change the factor of a slope by 0.5
+%, twice the number of steps changes it by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -232,7 +232,7 @@ class _Weakened:
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: the scene has contacts, must have none")
-        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data that belong to its grid
+        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # has no data of the old grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
         def resistance(points, u, dt):
@@ -290,7 +290,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step / work of the shear stress, both by magnitude.
+        """Return the work of the viscous stress in a step, divided by the work of the shear stress (of magnitudes).
 
         Points that moved to another process are excluded.
         """
@@ -312,7 +312,7 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress, Pa; ValueError if rounding of coordinates exceeds the stress."""
+    """Return the mean norm of the effective stress, Pa; ValueError if coordinate rounding causes as large a stress."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -325,7 +325,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of the shear moduli, Pa, of soil with a strength: soft soil flows first."""
+    """Return the harmonic mean of the shear moduli, Pa, of soil with a strength, because soft soil flows first."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))

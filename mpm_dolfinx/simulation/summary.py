@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summary of a scene: its terms and solvers, reasons for absent ones, and its distribution over processes."""
+"""Summary of a scene: its terms and solvers, why others are absent, and its distribution over processes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Part:
 
     name: str
     used: bool  # whether the scene has it
-    why: str  # its form, or the reason for its absence
+    why: str  # form of the term, or the reason for its absence
 
 
 def parts(scene: Scene, state: State) -> list[Part]:

@@ -107,8 +107,7 @@ def run(
     probes
         Material particles with recorded results.
     observe
-        Functions of the simulation, called at each output time, such as a `Writer`; `result` then contains the
-        histories so far.
+        Functions of the simulation, called at each output time, such as a `Writer`; `result` has the histories so far.
     checkpoint
         Function called after all observers: a `Checkpoint`.
     after
@@ -117,7 +116,7 @@ def run(
         Whether to record energies of bodies with inertia, and work since the start of the run: `Result.energies`.
     progress
         Whether to show a progress bar on a terminal, and to warn of the first reduced step. The logger `mpm_dolfinx`
-        reports the others at level INFO.
+        reports the other reduced steps at level INFO.
 
     Returns
     -------
@@ -152,7 +151,7 @@ def run(
     now = simulation.state.t
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
-    state = simulation.scene.followed(simulation.state)  # the first step depends on the cells
+    state = simulation.scene.followed(simulation.state)  # the first step depends on the size of the cells
     rule = step_rule(times, rtol, first_step, max_step, simulation.scene, state.points)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
@@ -284,7 +283,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run.  They include the times of the earlier run that it continues."""
+    """Wall time and profile of a run, including those of the earlier run that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall

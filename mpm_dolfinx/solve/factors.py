@@ -9,12 +9,12 @@ as long, and 25 ms for a solve. With few processes, one process therefore holds 
 solves use. Another holds the factors of pressures, computed at the same time. With both factorised on all of four
 processes, which share the memory's bandwidth, the factorisations took 1.7 times as long.
 
-Large bodies need nested dissection. With 504000 unknowns in 2D, repeated factors ordered by grid lines take 3.0 s and
-4.6e7 entries, see `dissection`. PETSc's nested dissection takes 5.1 s and 5.0e7, minimum degree 6 to 12 s and 7.5e7
-(MUMPS 6.2 s and 5.3e7). With a tenth of the unknowns they take 80, 110, 120 ms; with fewer unknowns the same time.
+Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
+(`dissection`) takes 3.0 s and 4.6e7 entries. PETSc's nested dissection takes 5.1 s and 5.0e7, minimum degree 6 to 12 s
+and 7.5e7 (MUMPS 6.2 s and 5.3e7). With a tenth of the unknowns the three take 80, 110, 120 ms; with fewer the same.
 
-These figures are for the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use. With OpenBLAS MUMPS takes a half
-to a third of the time.
+The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use it. With OpenBLAS MUMPS takes 1/2 to
+1/3 of the time.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ MOST = 500
 With PETSc's restarts after 30 iterations, FGMRES stagnates where the tangent of a footing is nearly singular: solves
 then end after 500 iterations, and take 50 without a restart. Vectors are allocated on demand.
 """
-TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
+TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations, indefinite preconditioner, indefinite matrix
 
 
 def direct_solver(
     A: PETSc.Mat, name: str, symmetric: bool = True, gathered: bool = False, package: str | None = None
 ) -> PETSc.KSP:
-    """Return a solver that factorises A, and again after A has changed; symmetric: as L D L^T.
+    """Return a solver that factorises A at the first solve, and after changes of A; if `symmetric`, as L D L^T.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFa
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise matrices at the same time if different processes hold their factors; else the solves factorise."""
+    """Factorise all matrices at the same time if different processes hold their factors; else at the first solve."""
     for pc in preconditioners:
         pc.setUp()
     for pc in preconditioners:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Line search: length of a Newton step, see `Newton._line_search`.
 
-Without yield the step is full, even if the residual grows: rotations of a bending body cause a spurious stretch at
-first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
+Without yield the step is full, even if the residual grows, because rotations of a bending body cause a spurious stretch
+at first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
 In yielding soil the step is full if the residual falls, or if the residual forces at its end do less than half of the
 initial work along it. Otherwise the search ends where their work is about zero (Matthies and Strang 1979). There the
-unloading soil is elastic, and so it is in the next tangent. The work includes that of the fluid's residual, because
+unloading soil is elastic, also in the next tangent. The work includes that of the fluid's residual, because
 the forces' work alone nearly vanishes if only the fluid is out of balance. Shorter steps with smaller residuals would
 lead to more short steps. Bracketed secants find the point. Soil that has lost its strength needs several secants: with
 one secant, a slumping bank takes twice the Newton steps.
@@ -14,9 +14,8 @@ one secant, a slumping bank takes twice the Newton steps.
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
 overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
 relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows with
-the step length for any soil. Soil that has not yielded is regularised too: when it first yields, it flows as far.
-Before the first yield there is no regularisation while the tangents converge: it would cost wet elastic soil 1.6 times
-the Newton steps.
+the step length for any soil. Soil that has not yielded is regularised too, because it flows as far when it first
+yields. Before the first yield, with tangents that converge, it would cost wet elastic soil 1.6 times the Newton steps.
 
 A few flowing points may give the tangent a negative stiffness. Newton's direction then leads backwards: it unloads
 these points, the next step loads them again, and the iterations cycle. The work of the residuals along the direction is
@@ -33,7 +32,7 @@ import numpy as np
 EXPLODES, SHORTEST = 1e4, 1e-3
 """Growth of the residual above which a step without yield is halved, and smallest fraction of the full step.
 
-With 1e3 and 1e5 scenes take the same steps: the growth is below both, or the residual is not finite.
+With a growth of 1e3 or 1e5 scenes take the same steps, because it is below both, or the residual is not finite.
 """
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
@@ -53,7 +52,7 @@ class Halving:
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Halving | None:
-        """Return the next trial after one in which the residual grew by the factor `growth`; None: the search ends."""
+        """Return the next trial after one in which the residual grew by a factor `growth`; None if the search ends."""
         ends = growth <= self.limit or self.step < 2 * SHORTEST
         return None if ends else Halving(0.5 * self.step)
 

@@ -11,19 +11,19 @@ In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K. Other me
 algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15. Conjugate gradients on the Schur complement took 3
 iterations, but 35 to 60 cycles in their inner solves. Flexible GMRES with inner solves to 0.1 or 0.01 took 12 to 24
 cycles. MINRES with the diagonal blocks took 17 to 23 cycles, and left five times the residual. In 2D GMRES takes 8
-iterations to 1e-5, 12 with AMG on P.
+iterations to 1e-5, and 12 with algebraic multigrid on P.
 
-At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells. If a solve takes too many iterations (see
-`plan`), or is predicted to, factors of K replace the cycle, and are kept until a solve with them takes too many.  With
-other tangents of the step a solve takes about 10. A step takes 6.2 s, with new factors for each tangent 8.5 s (4 to 6
-iterations). Four steps of yielding soil, 12^3 cells, take 33 s, with new factors 41 s. MUMPS factorises 3190 unknowns
-in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s). Solves then take at most 19 iterations, at nu = 0.49 with contrasts of 1e3 at
-most 22.
+At nu = 0.499 the cycle is poor, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too many
+iterations (see `plan`), or is predicted to, factors of K replace the cycle, and are kept until a solve with them takes
+too many.  With other tangents of the step a solve takes about 10.  A step takes 6.2 s, but 8.5 s with new factors for
+each tangent (4 to 6 iterations); four steps of yielding soil, 12^3 cells, take 33 and 41 s.  MUMPS factorises 3190
+unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations (22 at nu = 0.49 with contrasts
+of 1e3).
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
 wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28. Its time is 0.9 times that of a
-direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage, p -> p + k B
-u, K is as at nu = 0.3, but alternating pressures have almost no stiffness: 500 iterations.
+direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage (p -> p + k B
+u), K is as at nu = 0.3, but GMRES takes 500 iterations, because alternating pressures have almost no stiffness.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid residual / fluid volume that the residual forces would displace in a drained body.
+"""Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
 Sealed bodies exchange nearly no fluid. With scales that differed by 5e5, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()
-"""Context between solves: PETSc keeps the last context and all its references."""
+"""Context between solves, because PETSc keeps the last context and all its references."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""
@@ -189,7 +189,7 @@ class BlockSolver:
         residuals = self._momentum.residual, self._storage.residual
         scale_u, scale_p = scales
         scale_p = np.maximum(scale_p, LEAST * scale_u * operator.displaced())
-        if on_u.count > 1:  # parts are uncoupled: their residuals are scaled to equal size
+        if on_u.count > 1:  # parts are uncoupled, so their residuals are scaled to equal size
             sizes = [of.norms(r.array_r) for of, r in zip((on_u, on_p), residuals, strict=True)]
             size = np.hypot(sizes[0] / scale_u, sizes[1] / scale_p)
             scale_u, scale_p = (scale * np.where(size > 0, size, 1.0) for scale in (scale_u, scale_p))

@@ -6,8 +6,8 @@ interpolated bilinearly between nodes, pressures between centres of cells. Coars
 the interpolation Q, so cut cells, penalties and laws need no special treatment.
 
 With 504000 displacements and 251000 pressures in 2D (10^6 points) both hierarchies take 0.33 s, coarse matrices 0.1 s
-for each tangent, a cycle 0.06 s. A step takes 2.6 s in all, with factors (including ordering) 7.6 s. A wet cube of 20^3
-cells in shear, 16 Newton steps, takes 2.0 s; with smoothed aggregation (GAMG) it takes 11.6 s in as many iterations.
+for each tangent, a cycle 0.06 s. A step takes 2.6 s in all, but 7.6 s with factors (including ordering). A wet cube of
+20^3 cells in shear, 16 Newton steps, takes 2.0 s; with smoothed aggregation (GAMG) 11.6 s in as many iterations.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ OPTIONS = {
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
 """Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
 
-Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. Without a direct solver a solve takes 126
-iterations, with GAMG 112; with a single sweep GMRES fails. With a direct solver both smoothers take the same time.
+Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. Without a direct solver GMRES takes 126
+iterations, 112 with GAMG; with a single sweep of smoothing it fails. With a direct solver both smoothers are as fast.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -63,8 +63,7 @@ def multigrid_solver(
     name
         Prefix of the solver's PETSc options.
     places : (n, d + 1)
-        Unknowns of this process: indices along the axes of the grid, >= 0, and component, >= 0. Components are
-        interpolated separately.
+        Indices >= 0 along the grid axes, and component >= 0, of this process's unknowns. Components are uncoupled.
     held : (m, d + 1)
         Fixed degrees of freedom in cells of bodies; interpolated displacements vanish there.
     nodal
@@ -124,7 +123,8 @@ def interpolation(
     """Return the interpolation, this process's coarse unknowns, and fixed coarse degrees of freedom.
 
     A coarse cell is kept if a fine cell in it is an unknown. A coarse node is kept if it interpolates to a free fine
-    node; if it also interpolates to a fixed node, it must coincide with a free one. The columns are then independent.
+    node; if it also interpolates to a fixed node, it must coincide with a free one. The columns of
+    the interpolation matrix are then linearly independent.
     """
     rows, coarse, weights = _hats(places, nodal, lines)
     near_fixed = _hats(held, nodal, lines)[1]

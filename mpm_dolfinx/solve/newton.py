@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Unconnected parts of the bodies balance independently: each has its own forces and fluid, and its own step lengths.
+Unconnected parts of the bodies balance independently. Each part has its own forces, fluid and lengths of Newton steps.
 The state and the stiffness of other parts do not affect it.
 
 A Newton step of the two problems reads
@@ -40,26 +40,26 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance / storage error: unconverged rotations cause spurious volume changes
+INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations cause volume changes
 MOMENTUM_STEPS = 10
-REBALANCED = 6  # largest number of iterations with changing contacts / largest number without
+REBALANCED = 6  # largest number of iterations with changing contacts, divided by that without
 LOOSEST = 1e-2
-"""Largest residual after a linear solve / residual before the solve.  Halving this value changes the result of scene
-`soil` in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
+"""Largest residual after a linear solve, divided by the residual before it.  Halving this value changes the result of
+scene "soil" in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve / tolerance.  Halving this value changes the result of scene `soil` in
-tests/plateaus.py by 4.0e-12 (relative), doubling it by 3.1e-11, and finer cells by 3.0e-02.
+"""Residual after the last linear solve, divided by the tolerance.  Halving this value changes the result of scene
+"soil" in tests/plateaus.py by 4.0e-12 (relative), doubling it by 3.1e-11, and finer cells by 3.0e-02.
 """
-SETTLED = 1e-2  # residual below which slip of contacts may end: above it the contact area still changes
+SETTLED = 1e-2  # residual below which slip of contacts may end, as above it the contact area still changes
 ERROR = 1 / 20
-"""Assumed pressure error of a run / first-order estimate e.
+"""Assumed pressure error of a run, divided by the first-order estimate e.
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
-e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay in a step such errors add
-up, to 0.081 e. Measured errors, against steps an eighth as long: 0.05 to 0.08 e under loads and drained pressures that
-rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a consolidation; 0.17 e in a first
-step of a load that grows from zero; 0.26 e after a jump. The largest error of a run is thus 0.7 to 5 times e / 20.
+e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
+up, to 0.081 e.  Errors, measured against steps an eighth as long, are 0.05 to 0.08 e under loads and drained pressures
+that rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a consolidation; 0.17 e in a
+first step of a load that grows from zero; 0.26 e after a jump. Errors of a run are thus up to 0.7 to 5 times e / 20.
 """
 SUDDEN = np.sqrt(2)
 """Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
@@ -157,7 +157,7 @@ def note_pressures(
     dt: float,
     rates: Sequence[Rates],
 ) -> None:
-    """Store the pressure changes of a step and its estimated error in the report.
+    """Store the pressure changes and the estimated pressure error of a step in the report.
 
     The difference between the step and a first-order step is the fluid volume seconds (Q2 - Q1). The fixed-stress
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
@@ -250,7 +250,7 @@ class Newton:
                 log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
-            # infinite before any fluid has been exchanged
+            # a residual is infinite before any fluid has been exchanged
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle()
@@ -273,9 +273,8 @@ class Newton:
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors at the starting point: a guess that is better than the present (u, p), if any.
 
-        A better guess has less potential energy in elastic bodies, else a smaller residual. Bending has small forces:
-        a good guess of it may have a larger residual than no guess. Also return the other starting point, or
-        None.
+        A better guess has less potential energy in elastic bodies, else a smaller residual.  Bending needs small
+        forces, so a good guess of it may have a larger residual than no guess.  Also return the other start, or None.
         """
         errors, start = self._errors(), self._iterate()
         guesses = [] if self._linear or errors.worst <= self._scheme.tolerance else self._momentum.guesses()
@@ -302,7 +301,7 @@ class Newton:
     def _potential(self) -> Callable[[Errors], NDArray[np.float64]]:
         """Return a function for twice the present potential energy (parts,), J, less that at the present u.
 
-        It is the work of the residuals on the way, by the trapezoidal rule. The errors must be those of the present u.
+        The difference is the work of the residuals, by the trapezoidal rule. The errors must be those of the present u.
         """
         system = self._momentum.system
         r, u = system.residual.array_r.copy(), system.step.array_r.copy()
@@ -324,20 +323,27 @@ class Newton:
             f.x.array[rows] = values
 
     def check_stable(self) -> None:
-        """Raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
+        """Raise NotConverged at an unstable equilibrium, because smaller steps find the path that leaves it.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
-        delays buckling. If a step has kept its first tangent, the check follows in the next step.
+        delays buckling. If a step has kept its first tangent, the check follows in the next step. An equilibrium within
+        tolerance may seem unstable where only soft springs resist a motion, so it is corrected once.
         """
         if not negative_pivots(self._solvers.solve_u):
             return
         self._linearise()  # the last tangent may belong to another state
-        if count := negative_pivots(self._solvers.solve_u):
+        if not negative_pivots(self._solvers.solve_u):
+            return
+        self._solvers.solve_momentum()
+        self._move(-np.ones(self._momentum.system.of_parts.count))
+        errors = self._errors()
+        self._linearise()
+        if (count := negative_pivots(self._solvers.solve_u)) or errors.worst > self._scheme.tolerance:
             why = f"the equilibrium is unstable, its tangent has {count} negative eigenvalues"
             raise NotConverged(why, self.report.history)
 
     def alternate(self) -> Errors:
-        """Alternate, until both converge, solves of momentum at fixed pressure and of storage at fixed stress."""
+        """Solve momentum at fixed pressure and storage at fixed stress in turn, until both converge."""
         errors, report = self._errors(), self.report
         self._linearise()
         while (errors := self._augmented(errors)).worst > self._scheme.tolerance:

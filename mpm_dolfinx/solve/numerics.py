@@ -21,8 +21,8 @@ class Numerics:
     Parameters
     ----------
     quadrature
-        "domain": exact integration over cut particle domains. "point": at the material points, as in standard MPM; only
-        for boxes, not in axisymmetry.
+        "domain": exact integration over cut particle domains. "point": at material points, as in standard MPM; boxes
+        only, no axisymmetry.
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""PETSc options for the solvers: defaults of the package, which options of the user replace.
+"""PETSc options for the solvers; options of the user replace the defaults of the package.
 
 A name begins with the prefix of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line "mpm_" precedes it.
 """
@@ -41,7 +41,7 @@ def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterato
     for name, value in options.items():
         full = f"mpm_{name}"
         before[full] = given.getString(full) if given.hasName(full) else None
-        given.delValue(full)  # the query above has marked it as read
+        given.delValue(full)  # the query above has marked the option as read
         given.setValue(full, value)
     try:
         yield

@@ -8,7 +8,7 @@ Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solv
 fixed-stress operator. For large bodies GMRES solves for both unknowns together, see `monolithic`.
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, with the same
-digits. A solve takes 0.8 to 1 times as long. But this needs a copy of -B^T for each tangent, and fixed-stress
+digits. A solve takes 0.8 to 1 times as long. But it needs a copy of -B^T for each tangent, and fixed-stress
 iterations would still need the blocks.
 """
 
@@ -287,7 +287,7 @@ class LinearSolvers:
         of: OfParts,
         measured: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
     ) -> None:
-        """Solve iteratively for x with equal relative accuracy in all parts, which may have different scales.
+        """Solve iteratively for x with equal relative accuracy in all connected parts, whose scales may differ.
 
         measured: function that converts b to the vector whose norm the solver computes; None: b itself.
         """
@@ -338,7 +338,7 @@ class LinearSolvers:
         return self._g
 
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return P^-1 volumes, pressures, Pa: P is the fixed-stress operator, volumes, m^d, belong to owned cells."""
+        """Return the pressures P^-1 `volumes`, Pa, with the fixed-stress operator P; volumes of owned cells, m^d."""
         self._g.array_w[:] = volumes
         self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Choice of solvers: a function of the problem's properties, and the thresholds between methods.
+"""Choice of solvers by the properties of the problem, and the thresholds between methods.
 
 There are four methods for the linearised problem. Without fluid the momentum balance is solved alone. With fluid the
 displacements are eliminated (`schur`), or both balances are solved together (`monolithic`) or in turn (fixed-stress
@@ -38,7 +38,7 @@ class Thresholds:
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
         Iterations of a solve above which a direct solver replaces multigrid, or the next tangent renews the factors of
-        the fixed-stress operator. For the latter, 12, 25, 50 and 500 give the same Newton steps (footing on 9 cells).
+        the fixed-stress operator.  For this renewal, 12, 25, 50 and 500 give equal Newton steps (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
@@ -54,18 +54,17 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Tightest relative tolerance of a linear solve.  Halving this value changes the result of scene `soil` in
+"""Tightest relative tolerance of a linear solve.  Halving this value changes the result of scene "soil" in
 tests/plateaus.py by 4.0e-11 (relative), doubling it by 1.2e-11, and finer cells by 3.0e-02.
 """
 FORCING_3D = 1e-3
 """Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
-"""Largest ratio of successive residuals for which the next Newton step reuses the tangent.  Halving this value changes
-the result of scene `soil` in tests/plateaus.py by 4.9e-11 (relative), doubling it by 1.0e-11, and finer cells by
-3.0e-02.
+"""Largest ratio of successive residuals for which the tangent is reused.  Halving this value changes the result of
+scene "soil" in tests/plateaus.py by 4.9e-11 (relative), doubling it by 1.0e-11, and finer cells by 3.0e-02.
 """
 KEEP_WET = 0.01
-"""As `KEEP`, in wet 2D scenes without yield.  Halving this value changes the result of scene `beam` in
+"""As `KEEP`, in wet 2D scenes without yield.  Halving this value changes the result of scene "beam" in
 tests/plateaus.py by 1.8e-11 (relative), doubling it by 2.9e-10, and finer cells by 1.5e-02.
 """
 
@@ -79,7 +78,7 @@ class SolverPlan:
     route
         One of `ALONE`, `SCHUR`, `AT_ONCE`, `IN_TURN`.
     displacements, pressures
-        Solvers for K and for the fixed-stress operator; pressures is "" without fluid.
+        Solvers for K and for the fixed-stress operator; `pressures` is "" without fluid.
     krylov
         PETSc's name of the iterative solver; "preonly" for a direct solver alone.
     fallback
@@ -143,13 +142,13 @@ def plan(
 ) -> SolverPlan:
     """Return the solution method for a problem.
 
-    The tangent is reused while a Newton step reduces the residual to less than 0.05 of its value; to 0.01 in wet 2D
-    scenes without yield. The drained beam in 26 adaptive steps takes 205 Newton steps and 79 tangents with 0.05, 179
-    and 83 with 0.01, 174 and 94 with 0.002. In 3D tangents cost more: a beam takes up to a fifth longer with 0.01.
+    The tangent is reused while a Newton step reduces the residual to less than 0.05 of its value, or 0.01 in wet 2D
+    scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05, 179
+    and 83 with 0.01, and 174 and 94 with 0.002. In 3D tangents cost more: a beam takes up to a fifth longer with 0.01.
 
-    The relative tolerance of linear solves is at least 1e-5, with multigrid in 3D 1e-3. With factors an iteration is
+    The relative tolerance of linear solves is at least 1e-5, or 1e-3 with multigrid in 3D. With factors an iteration is
     cheap, and a looser tolerance for the fluid costs Newton steps: a footing on 21 cells (backward Euler) takes 299
-    with 1e-5, 370 with 1e-3.
+    Newton steps with 1e-5, and 370 with 1e-3.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""End of a step: particle domains move with the grid, F follows from their corners, pieces store the pressures.
+"""End of a step: particle domains move with the grid, their corners determine F, their pieces store the pressures.
 
 The grid is reset at the start of the next step, see `grid_reset`.
 """
@@ -48,13 +48,13 @@ from mpm_dolfinx.stepping.state import State, Stay, Trend
 TAKES_IN = 0.1
 """Rate of correction of the points' volume defect `owed`, per cell size of corner motion in their connected part.
 
-The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With 0,
-0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress. From 0.2 on,
-pressures of a manufactured solution converge with an order below 1.75. Without motion there is no correction, so the
-order in time is unaffected. The mean defect of drained parts is not corrected: with a correction, a column under
-varying gravity has order 1.2 in the step.
+The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With
+rates of 0, 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress.
+From 0.2 on, pressures of a manufactured solution converge with an order below 1.75. Without motion there is no
+correction, so the order in time is unaffected. The mean defect of drained parts is not corrected: with a correction, a
+column under varying gravity has order 1.2 in the step.
 
-Halving this value changes the result of scene `beam` in tests/plateaus.py by 1.7e-03 (relative), doubling it by
+Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.7e-03 (relative), doubling it by
 2.8e-03, and finer cells by 1.5e-02.
 """
 
@@ -185,7 +185,7 @@ class Motion:
         """Return the displacements (unknowns,), m, a local array, in the next seconds (s), from the trend of the state.
 
         The change of each domain is affine. A cell takes the mean of its pieces, and a node the mean of its cells, by
-        volumes. From rest, ten load steps of a drained beam take 50 Newton steps and 30 tangents; from here 33 and 13.
+        volumes. From rest, ten load steps of a drained beam take 50 Newton steps, 30 tangents; from this guess 33, 13.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
@@ -208,7 +208,7 @@ class Motion:
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t, s, up to a constant.
 
-        None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the domains were cut.
+        The result is None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None or self._storage.fluxes.flux is None:
@@ -253,9 +253,9 @@ class Motion:
         return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step: mean of Delta F over the pieces, scaled to the mean of det.
+        """Return F (n, d, d) of the points after a step, in the shape that laws use.
 
-        The shape is that of the laws' F.
+        It is the mean of Delta F over the pieces, scaled to the mean of its determinant.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -289,7 +289,7 @@ class Motion:
         bend: NDArray[np.float64],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with corners moved by `moved` (n, 2^d, d), m, and the quadratic correction `bend`; their F.
+        """Return the points with new F, and with corners moved by `moved` (n, 2^d, d), m, and the correction `bend`.
 
         If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`:
         the deformation there is permanent, and domains in kinks would give wrong values.
@@ -334,7 +334,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points with corrected corners of yielded domains that leave their cut, not in keeps (n,)."""
+        """Return the points with corrected corners of yielded domains, except where keeps (n,) is true."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -362,9 +362,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The defect is the increase of their fluid content, from volumes and cell pressures, minus the net inflow, as
-        fluid mass / density at zero pressure. Soil with a free surface has no defect, because its content excludes
-        drained water. Points with keeps (n,) have no correction.
+        The defect adds, to that of earlier steps, the increase of fluid content by volume and cell pressures minus the
+        net inflow, both as fluid mass / density at zero pressure, divided by alpha. Soil with a free surface has none:
+        its content excludes drained water. Points with keeps (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut

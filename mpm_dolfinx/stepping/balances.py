@@ -29,8 +29,8 @@ from mpm_dolfinx.stepping.state import State
 class Acting(NamedTuple):
     """Loads of a substep."""
 
-    substep: Substep  # its time weights
-    t: float  # time at its end, s
+    substep: Substep  # time weights of the substep
+    t: float  # time at the end of the substep, s
     loads: Sequence[Loads]
     gravity: NDArray[np.float64] | None  # (d,), m/s^2
 
@@ -62,7 +62,7 @@ class Start(NamedTuple):
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return error and motion of the step, see `motion_error`, if the run needs them, else 0.
+        """Return error and size of the motion in the step, see `motion_error`, if the run needs them, else 0.
 
         flights: velocities after each substep; substep: the last substep.
         """
@@ -109,7 +109,7 @@ class Balances(NamedTuple):
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep; supports then include their forces for a balanced initial stress."""
+    """Return the loads of each substep; forces of supports then include the reactions to the initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -135,7 +135,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may start from extrapolated motion: with yield, or with quasi-static contact."""
+    """Return whether Newton's method may start from extrapolated motion: if soil yields, or in quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any(one.touches for one in loads))
 
@@ -143,7 +143,7 @@ def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
     """Return displacements (unknowns,), m, extrapolated from the previous substep or step.
 
-    The result is a local array; None if there is no previous motion, or if it is useless: see `leads`.
+    The result is a local array; None if there is no previous motion, or if it is no good guess, see `leads`.
     """
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):

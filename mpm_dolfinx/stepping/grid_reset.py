@@ -2,7 +2,7 @@
 """Reset of the grid: domains cut by the cells, active cells, and matrices that are reused while the pieces are valid.
 
 A step begins with a reset (`Scene.on_grid`), unless no corner has moved by more than a small fraction of a cell since
-the last one. At the end of a step only the points move (`advance`), and their pieces store the pressures.
+the last reset. At the end of a step only the points move (`advance`), and their pieces store the pressures.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class OnGrid(Keyed):
     quadrature
         Integration points of the scene.
     momentum, storage
-        Forms; their coefficients are set from the material in the cells. Storage is None without fluid.
+        Forms, whose coefficients are set from the material in the cells; `storage` is None without fluid.
     cut
         The cut particle domains.
     of_fluid
@@ -131,7 +131,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
-        """Faces between active cells that have a ghost mass: at least one of the cells is not full."""
+        """Faces between active cells that have a ghost mass, because at least one of the two cells is not full."""
         return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
 
     @property
@@ -200,7 +200,7 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return data of the pieces by name: stored values where points keep their pieces, else `fresh` (m, ...)."""
+        """Return the named data of the pieces: stored values where points keep their pieces, else `fresh` (m, ...)."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
@@ -256,7 +256,7 @@ class OnGrid(Keyed):
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
         The mean of the pieces' mass potentials in a cell is that of the cell. The weight is `store` (m,), m^d/Pa, the
-        storage of the pieces; in cells without storage the volume. t, s: time of the pressures on drained sides.
+        storage of the pieces; in cells without storage the volume. t: time, s, of the pressures on drained sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
         hydrostatic pressures `at_rest`, if fluid can flow.
@@ -310,7 +310,7 @@ class OnGrid(Keyed):
         The reconstruction acts on differences from hydrostatic pressures, which cause no flow through sealed sides. In
         axisymmetry centroids and mean refer to the sections.
 
-        t, s: time of the pressures on drained sides; at_rest: hydrostatic pressures, if fluid can flow.
+        t: time, s, of the pressures on drained sides; at_rest: function for hydrostatic pressures, None without flow.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -396,7 +396,7 @@ class OnGrid(Keyed):
         return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
-        """Return the conductivities of the filled owned cells in the reference configuration, m/s, as mobility."""
+        """Return conductivities of filled owned cells in the reference configuration, m/s, in place of mobilities."""
         at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
         mean = self.contents.mean(at_pieces)
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
@@ -574,7 +574,7 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function that returns the fluxes at u; argument: whether a step begins.
+        """Return the fluid conditions, and a function of (whether a step begins) that returns the fluxes at u.
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 

@@ -53,15 +53,15 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Number of mixed iterations; the iteration ends after PATIENCE iterations that do not reduce the residual by LESS.
+"""Number of mixed iterations; PATIENCE: iterations without a reduction of the residual by LESS, after which it ends.
 
-Tests: a wet bank, elastic or frictional, blocks on a rough base, one of them half supported. With 40 and 16 and with 80
-and 24 the remaining forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 up to 6e-3.
+Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16 or 80
+and 24 the remaining relative forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 they are up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Change of stress by balancing / largest given stress, above which a warning is given.
+"""Change of stress by balancing, divided by the largest given stress, above which a warning is given.
 
-Also the largest relative residual of the forces, due to errors of the discretisation.
+It is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
 
 
@@ -169,9 +169,9 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return a state before the next step, and tractions on new quiet sides: points (m,) and (m, d), Pa, by data name.
+    """Return a state before the next step, and by data name the points (m,) and tractions (m, d), Pa, on quiet sides.
 
-    The tractions balance stresses, loads of the previous stage, and remaining supports. begun: the new stage.
+    The tractions balance stresses, loads of the previous stage, and remaining supports. after: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -205,7 +205,7 @@ def _released(
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with data of conditions: initial values, or the values in `before`, the same points."""
+    """Return the points with the data that conditions store: initial values, or those of `before`, the same points."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
@@ -230,7 +230,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError for quiet sides in a stage whose weight differs from before: their traction does not bear it."""
+    """Raise ValueError for quiet sides in a stage with another weight, which their tractions do not bear."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -357,8 +357,8 @@ def balanced(scene: Scene, state: State) -> State:
 
     A displacement w of the grid is balanced with the strains of the pieces. Points store the mean strain of their
     domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes; nodal forces balance the remainder, `State.held`. Support forces are evaluated at
-    the displacement w, `State.rest`: sides keep their seeded positions for any prescribed displacement at the start.
+    strains cannot balance all nodes; nodal forces `State.held` balance the remainder. Support forces are evaluated at
+    the displacement w, `State.rest`, so sides keep their seeded positions for any prescribed displacement at the start.
 
     Raises
     ------

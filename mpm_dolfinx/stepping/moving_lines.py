@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that move with a body or tool: each reset computes them from the state, so a resumed run repeats them."""
+"""Grid lines that move with a body or tool; each reset computes them from the state, also in a resumed run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     Parameters
     ----------
     left
-        Function that returns a state ready for a reset; called while the grid has the state's lines.
+        Function that returns a state ready for a reset; it is called while the grid has the lines of the state.
     """
     before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
     grid.move(before)

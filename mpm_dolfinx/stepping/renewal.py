@@ -9,9 +9,10 @@ domains fill the same region, with the same surface and contents. Cells of a dom
   there becomes `EDGES` edges, with the same ends, area and sharp corners.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
-each cell. Mass-weighted sums of other point data are exact too, also of the logarithm of the elastic left Cauchy-Green
-tensor. These data are means over the overlap, shifted to the new centroids by fitted slopes, within the range of the
-values. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings are unchanged.
+each cell. Mass-weighted sums of other point data are exact too, such as of the logarithm of the elastic left
+Cauchy-Green tensor. These data are means over the overlap of old and new domains, shifted to the new centroids by
+fitted slopes, within the range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or
+several surface crossings are unchanged.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain in cells: longer domains should bend, but have straight edges. Source: definition."""
+"""Largest length of a domain in cells; a longer one should bend, but has straight edges. Source: definition."""
 
 
 class Renewal:
@@ -89,7 +90,7 @@ class Renewal:
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) have yielded, with a law that has an elastic strain tensor."""
+        """Return at which points (n,) soil has yielded or was renewed; False for laws without the state `plastic`."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
@@ -160,7 +161,7 @@ class Renewal:
     ) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, of new domains, so that their cells contain the fluid of the old domains.
 
-        group (m,): group of each new domain. Pressures are means in each group: by storage, or if zero by volume.
+        group (m,): group of each new domain, see `RefilledCells`; it has one pressure, the mean by storage or volume.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
@@ -168,7 +169,7 @@ class Renewal:
         piece, groups, share = work.into
         of, count = pieces.point[piece], int(group.max()) + 1
         others = pieces.fraction.copy()
-        others[piece] = 0.0  # very thin pieces, which are added to the others of their domain
+        others[piece] = 0.0  # very thin pieces are added to the other pieces of their domain
         whole, held = (sum_by(pieces.point, others * values, len(points)) for values in (1.0, potential))
         mean = np.divide(held, whole, out=np.zeros(len(points)), where=whole > 0)[of]
         brings = pieces.fraction[piece] * potential[piece] + (share - pieces.fraction[piece]) * mean
@@ -293,7 +294,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the points for which kept (n,) is true, together with the new points `made`."""
+    """Return the points where kept (n,) is true, together with the new points `made`."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 

@@ -25,20 +25,20 @@ class Result:
     """Histories of a run, with one row for each output time, including the start.
 
     Histories are read-only arrays (n, ...) for n output times. Quantities that were not recorded have an axis of length
-    0: (n, 0, d) without probes.
+    0, such as (n, 0, d) without probes.
 
     Parameters
     ----------
     rows
         Records at the output times, see `Row`.
     steps, newton, coupling, cuts, rejected
-        Counts so far: steps; Newton and coupling iterations; steps reduced to converge, and rejected by their error.
+        Numbers so far: steps, Newton iterations, coupling iterations, reduced steps, steps rejected by their error.
     rederived
         Number of inverted domains that were re-initialised from F.
     renewed, renewals
         Number of renewed domains of yielded soil, and of resets of the grid with renewal.
     balance, residual
-        Largest relative errors so far: of the fluid balance, and residuals of the two balances.
+        Largest values so far, relative: error of the fluid mass balance; residual of the momentum and fluid equations.
     wall, profile
         Wall time, s, of the whole run, and of each part of it on this process.
     converged
@@ -123,7 +123,7 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Force, N, and moment, N m, (times, d + 1), in 3D (times, 6), of each tool and contact, by name."""
+        """Force, N, and moment, N m, (times, d + 1), in 3D (times, 6), of each tool and contact on bodies, by name."""
         return self.outcome("tool_forces")
 
     @cached_property

@@ -46,13 +46,13 @@ from mpm_dolfinx.stepping.state import State
 
 
 class When(NamedTuple):
-    """A substep."""
+    """Times and weights of a substep."""
 
-    t: float  # time at its end, s
+    t: float  # time at the end of the substep, s
     since: float  # time since the start of the step, s
     gravity: NDArray[np.float64] | None  # (d,), m/s^2
-    own: float  # weight of the rate at its end, s
-    past: float  # fraction of the displacement at its start, see `Velocity`
+    own: float  # weight of the rate at the end of the substep, s
+    past: float  # fraction of the displacement at the start of the substep, see `Velocity`
 
 
 class Scene:
@@ -207,7 +207,7 @@ class Scene:
         grid = self.grid
 
         def make() -> OnGrid:
-            self._assembled.clear()  # coefficients of its forms change now
+            self._assembled.clear()  # the coefficients of the forms change now
             with _compat.Timer("cut domains"):
                 more = self.momentum.inertia is not None, self.storage is not None
                 cut = CutDomains(grid, points, self.numerics.quadrature == "domain", *more)
@@ -321,7 +321,7 @@ class Scene:
         for name, one in {**materials, "fluid": self.fluid}.items():
             out[name] = None if one is None else type(one).__name__
             constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-            laws = ("retention",)  # the checksums identify a law by its values
+            laws = ("retention",)  # sampled values identify these laws
             given = {key: value for key, value in constants.items() if key not in laws and value is not None}
             constants = {key: value for key, value in given.items() if not callable(value)}
             out |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}

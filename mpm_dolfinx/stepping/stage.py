@@ -76,8 +76,8 @@ class Stage:
     """The conditions of a stage."""
 
     given: Mapping[str, Condition]  # conditions by name, as given
-    named: Mapping[str, Condition]  # the same, with the unit weight of water of the pore fluid
-    conditions: Mapping[str, Any]  # walls, with the axis, and gravity
+    named: Mapping[str, Condition]  # the same; water pressures have the unit weight of the pore fluid
+    conditions: Mapping[str, Any]  # walls (in axisymmetry also the axis), and gravity
     present: tuple[bool, ...]  # whether each body is present
     later: tuple[int, ...]  # indices of bodies to be added
     free: NDArray[np.bool_]  # (nodes, d) whether walls leave each component free
@@ -204,7 +204,7 @@ def stage(
     bodies, materials
         All bodies and materials of the scene.
     momentum, fed
-        Forms with the loads of all stages; terms of all stages in the balance of fluid.
+        Forms with the loads of all stages, and terms of all stages in the balance of fluid.
     conditions
         walls, conditions, gravity and inertia: see `Simulation`.
     present, later
@@ -280,7 +280,7 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
 
 
 def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
-    """Return which components (nodes, d) walls fix."""
+    """Return which displacement components (nodes, d) are fixed by walls."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
     if not isinstance(walls, Mapping):

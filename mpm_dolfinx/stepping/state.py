@@ -38,7 +38,7 @@ class Stay:
     points
         The material points at the reset of the grid.
     keeps : (n,)
-        Whether each point keeps its pieces; its part of the bodies then hardly moves. None: all points.
+        Whether each point keeps its pieces, because its connected part hardly moves; None if all points do.
     """
 
     points: MaterialPoints
@@ -62,7 +62,7 @@ class Trend:
     lengths : (k,)
         Lengths of the steps, s, the last one first.
     rates : (n, k, d, 1 + d)
-        Mean rates of x, m/s, and of F, 1/s, in each of them.
+        Mean rates of x, m/s, and of F, 1/s, in each of these steps.
     """
 
     lengths: NDArray[np.float64]
@@ -83,7 +83,7 @@ class Trend:
 class State:
     """All data of a scene that one step passes to the next; immutable, as a step returns a new state.
 
-    A checkpoint stores these data, except the stage, which the script defines, and the watched points of a run.
+    A checkpoint stores all of these data except two: the stage, which the script defines, and the watched points.
 
     t
         Time, s.
@@ -98,7 +98,7 @@ class State:
         Number of resets of the grid.
     lines
         Coordinates (n,), m, of grid lines by axis "x", "y", "z", at the last reset of a grid with moving lines,
-        relative to its `base`; None before, and for other grids.
+        relative to its `base`; None before a reset, and for other grids.
     outcome
         Results of conditions at the end of the last step, by quantity and name; nan for new conditions before the first
         step of a stage. reactions (d,), N, of prescribed displacements; wall_reactions (d,), N, of the grid's walls;
@@ -113,7 +113,7 @@ class State:
         Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
         or contact. None before the first step, and without yield or contact.
     trend
-        Motion in the last steps, an initial guess in dry elastic bodies; None else, at first and after other bodies.
+        Motion in the last steps, an initial guess in dry elastic bodies; None in other scenes, and after new bodies.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
         forces, after a new stage, and after a reset of the grid.

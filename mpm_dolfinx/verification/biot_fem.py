@@ -63,12 +63,12 @@ from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.verification.pores import Pores
 
-ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
-CUT_DEGREE = 20  # quadrature degree on a partly loaded side: an edge of the region may cut facets
+ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u, and space of p
+CUT_DEGREE = 20  # quadrature degree on a partly loaded side, because an edge of the region may cut facets
 
 
 class Space:
-    """Space W of the unknowns w = (u, p/scale), or w = u, and functions in this space.
+    """Space W of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
     old: w at the start of the step; past: change of w due to the rate of the previous substep; b, f: residual and
     loads.  same: copy of w that is not differentiated; u, p: displacement and pressure.  p_dofs: degrees of freedom of
@@ -115,8 +115,8 @@ class BiotFEM:
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
-        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides; nodal pressures on whole facets within a region.
-        Other sides are free and sealed.
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides; pressures on whole facets in a region.  Others are
+        free and sealed.
     pressure : Pa
         Initial pore pressure, or a function of positions x (m, d), m.  The initial effective stress is zero: loads or
         strains must balance the pressure.
@@ -126,10 +126,9 @@ class BiotFEM:
         User-defined terms as for `Simulation`, but not on sides: see `user_functions`, `Source`.
         q is a test function of the elements for pressure.
     element
-        "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells, with two-point fluxes.
+        "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1 displacement, cellwise pressure, two-point fluxes.
     numerics
-        Method of time integration, and tolerance of the residual relative to the loads, or to the residual at the start
-        of a step.
+        Time integration, and tolerance of the residual relative to the loads, or to the first residual of a step.
     axisymmetric
         As for `Grid`.
     """
@@ -508,7 +507,7 @@ class BiotFEM:
         snes = self._snes
         space.past.x.array[:] = substep.before / substep.own * (space.w.x.array - space.old.x.array)
         space.f.x.array[:] = 0.0
-        if substep.before and forms.flux is not None:  # flux by the rate at the end of the previous substep
+        if substep.before and forms.flux is not None:  # flux with the rate at the end of the previous substep
             forms.dt.value = substep.before * dt
             self._assemble(space.f, forms.flux).scale(-1.0)
         forms.dt.value = substep.own * dt

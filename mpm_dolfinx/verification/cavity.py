@@ -21,7 +21,7 @@ from mpm_dolfinx.materials.evaluate import LawAtPoints
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 State = dict[str, NDArray[np.float64]]
-CLOSE, MOST = 1e-10, 60  # relative residual; Newton iterations
+CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newton iterations
 
 
 class _Rings:
@@ -73,7 +73,7 @@ class Cavity:
     def widened(self, radius: float) -> Cavity:
         """Return the cylinder after drained expansion of the cavity to a radius, m, in one step."""
         n, r = len(self.R), self.r.copy()
-        r += (radius - r[0]) * r[0] / r  # as in incompressible soil
+        r += (radius - r[0]) * r[0] / r  # initial guess, the motion of incompressible soil
         r[0] = radius
         middle, h = (self.R[1:] + self.R[:-1]) / 2, np.diff(self.R)
         weight = middle * h
@@ -127,7 +127,7 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return the total radial stress, outer radius minus wall, and the effective radial stress at the wall, Pa.
+    """Return the total radial stress at the outer radius minus that at the wall, and the effective one at the wall, Pa.
 
     The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii:
     successive radii a of the cavity, in small steps.

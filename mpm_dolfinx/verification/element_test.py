@@ -32,7 +32,7 @@ KINDS = (
     *WETTING,
 )
 AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
-ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # Newton iterations; halvings of a step; relative accuracy
+ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # limits: Newton iterations, halvings of a step, relative residual
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def element_test(
         out.append(point.moved(out[-1], test, start, goal))
     states = {name: np.array([s.state[name] for s in out]) for name in material.state}
     F, stress = (np.array([getattr(s, name) for s in out]) for name in ("F", "stress"))
-    # undrained: the lateral total stress is constant, in shear the normal total stress
+    # in undrained tests the lateral total stress is constant, in shear the normal total stress
     pressure = (stress - stress[0])[:, 1, 1] * test.endswith("undrained")
     return ElementTest(F, stress, np.array([first, *path]), pressure, states)
 
@@ -198,7 +198,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return the form data of the point for several deformation gradients F (m, 3, 3), and one state."""
+        """Return data of the point for forms, for several deformation gradients F (m, 3, 3) and one state."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8

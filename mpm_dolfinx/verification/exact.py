@@ -4,7 +4,7 @@
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
 T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a closed inverse of the
 Laplace transform is used, with tanh X, coth X -> 1 for X = sqrt(s).  Errors of both are of the order of
-erfc(1/sqrt(T)) < 2e-23 or less: both are exact to round-off.
+erfc(1/sqrt(T)) < 2e-23 or less, so both are exact to round-off.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class Mandel:
         """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), (TERMS,)."""
         n = np.arange(TERMS) * np.pi
         r = n + np.pi / 2
-        for _ in range(50):  # Newton on a convex function, from its positive side: monotone
+        for _ in range(50):  # Newton's method is monotone for a convex function from its positive side
             r = r - (r - n - np.arctan(self._ratio * r)) / (1 - self._ratio / (1 + (self._ratio * r) ** 2))
         return r
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pores of the finite element reference that drain under suction, see `retention`; pressures are in a given unit."""
+"""Pores, in the finite element reference, that drain under suction: see `retention`; pressures in a given unit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Pores:
     domain
         Mesh of the forms.
     law
-        Retention curve; None: pores stay saturated.
+        Retention curve; None if the pores stay saturated.
     unit
         Unit of the pressures, Pa.
     """
