@@ -239,7 +239,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
-    "damping of yielded soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
+    "damping as in yielded instead of elastic soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
     "mean dilatation": (
         lambda n: block(n, soil(nu=LOCKING - 1e-3)),
         lambda n: block(n, soil(nu=LOCKING + 1e-3)),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Functions of several demos: options, first and last lines, tables, pictures, and two terms in UFL."""
+"""Functions that several demos share: options, first and last printed lines, tables, pictures, two terms in UFL."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ COLOURS = "#0072B2 #E69F00 #009E73 #D55E00 #CC79A7 #56B4E9 #882255 #7F7F7F #9999
 
 
 class Parser(argparse.ArgumentParser):
-    """The options of a demo: its own, --json and, if it writes files, --out.
+    """Command line of a demo: its own options, --json and, if the demo writes files, --out.
 
-    processes: whether the demo runs on several processes.
+    processes: whether the demo also runs on several processes.
     """
 
     class Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
@@ -42,7 +42,10 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
 
     def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
-        """Return the options, with the run time (s or min) of the gallery in `takes`, if it is there."""
+        """Return the options; `takes` is the run time in the table Gallery of README.md, or None.
+
+        The time (s or min) is known if the table contains this demo with the same options.
+        """
         args = sys.argv[1:] if args is None else list(args)
         o = super().parse_args(args, namespace)
         if not self.processes:
@@ -64,9 +67,9 @@ class Parser(argparse.ArgumentParser):
 
 @contextmanager
 def results(o: argparse.Namespace) -> Iterator[dict]:
-    """Yield a dict for the results of the demo; print the run time before, and the results (--json) after the run.
+    """Yield a dict for the results; print the expected run time at the start and, with --json, the results at the end.
 
-    A run that fails (`mpm.GaveUp`) prints one line.  Then `converged` is False, and earlier results remain.
+    If the run fails (`mpm.GaveUp`), print one line, set `converged` to False, and keep the earlier results.
     """
     out, start = {}, time.perf_counter()
     if first() and o.takes:
@@ -122,7 +125,7 @@ def write_csv(path: Path, head: Iterable[str], rows: Iterable[Iterable]) -> None
 
 
 def figure(rows: int, columns: int, size: tuple[float, float]):
-    """Return (figure, axes), size in inches, of matplotlib without a display."""
+    """Return a figure of matplotlib, which needs no display, and its axes (rows, columns); `size` is in inches."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -135,7 +138,7 @@ def figure(rows: int, columns: int, size: tuple[float, float]):
 
 
 def save(fig, path: Path, dpi: int = 130) -> None:
-    """Write a figure as a picture of at most 256 colours, with a third of the file size."""
+    """Write a figure as a picture of at most 256 colours, which reduces the size of the file to a third."""
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +149,7 @@ def save(fig, path: Path, dpi: int = 130) -> None:
 
 
 def weight(unit_weight: float) -> Callable:
-    """Return the term of a weight, N/m³ of the undeformed ground, downwards."""
+    """Return a term for `terms=`: a downward weight, given in N/m³ of undeformed ground."""
 
     def weight(points, v):
         return unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
@@ -155,7 +158,7 @@ def weight(unit_weight: float) -> Callable:
 
 
 def viscous(viscosity: float) -> Callable:
-    """Return the potential of a viscous stress 2 eta D, eta in Pa s, with the strain rate D = sym grad u / dt."""
+    """Return a term for `terms=`: the viscous stress 2 eta D, eta in Pa s, with strain rate D = sym grad u / dt."""
 
     def viscous(points, u, dt):
         strain = ufl.sym(points.grad(u))
@@ -165,7 +168,7 @@ def viscous(viscosity: float) -> Callable:
 
 
 def domains(ax, corners: np.ndarray, values: np.ndarray | None = None, **style):
-    """Draw the domains of points by their corners (np, 4, 2), coloured by values (np,); return the collection."""
+    """Draw particle domains with corners (np, 4, 2), coloured by values (np,); return matplotlib's collection."""
     from matplotlib.collections import PolyCollection
 
     style = {"edgecolors": "face", "linewidth": 0.2} | style

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""A dam: seepage with a free surface during drawdown of the reservoir, in unsaturated soil.
+"""Seepage with a free surface through a dam of unsaturated soil, while the level of the reservoir falls.
 
 A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
-reservoir, 5 m.  Then the downstream slope becomes permeable, and the flow becomes steady.  Finally the reservoir falls
-by 2 m in five days, and the free surface, p = 0, falls more slowly as the soil drains.  Above the free surface, water
-flows under suction (`mpm.VanGenuchten`).  The reservoir loads the upstream slope.  Above the water levels, both slopes
-are seepage faces.
+reservoir, 5 m.  Then the slope away from the reservoir becomes permeable, and the flow becomes steady.  After that the
+level of the reservoir falls by 2 m in five days, and the free surface, p = 0, follows as the soil drains.  Above the
+free surface water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the slope on its side.
+Above this water, both slopes are seepage faces.
 
 Checks:
 
-* `flow`: outflow of a rectangular dam, divided by the exact outflow.  The dam is 9.6 m wide, with water levels of 10 m
-  and 2 m, and hydrostatic suction on its sides above these levels.  The exact flow is k (H1^2 - H2^2) / (2 L) (Dupuit,
-  Charny).  Here Kirchhoff's potential, the integral of k_r over the head, replaces the head;
-* `steady`: inflow of the dam divided by its outflow, before the reservoir falls;
-* `drained`: outflow of a column, divided by the outflow of finite elements on cells of a quarter of the size.  The free
-  surface of the column falls from 8 m towards 2 m.
+* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
+  water at its sides.  Above these levels the suction at the sides is hydrostatic.  The exact flow is Dupuit's and
+  Charny's k (H1^2 - H2^2) / (2 L), if Kirchhoff's potential (the integral of k_r over the head) replaces the head;
+* `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
+* `drained`: ratio of the outflow of a column to that of finite elements on cells of a quarter of the size.  The free
+  surface in the column falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since 
 
 @dataclass
 class Dam:
-    """Flows, corners and pressures in steady flow and at each time of `SEEN`.
+    """Flows, corners and pressures of the dam, in steady flow and at each time of `SEEN`.
 
-    flows: (2,), m^2/s, out of the two slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
+    flows: outflows through both slopes (2,), m^2/s.  frames: corners (n, 4, 2), m, and pressures (n,), Pa, of the
+    domains.
     """
 
     flows: list[np.ndarray] = field(default_factory=list)
@@ -71,7 +72,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Lower the reservoir of a dam on cells of size h, m; steps: number in each period, and in the fall."""
+    """Run the dam on cells of size h, m, with `steps` equal steps of each length in `SETTLES`, and in the drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -136,7 +137,7 @@ def rectangular(cells: int) -> float:
 
 
 def driving(level: float, top: float) -> float:
-    """Return the integral of Kirchhoff's potential over the height, m^2, for hydrostatic water with a level, m."""
+    """Return the integral of Kirchhoff's potential over a hydrostatic side, m^2; level, top: of water and dam, m."""
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
     k_r = filled**law.l * (1 - (suction * WEIGHT / law.entry) ** (law.n - 1) * filled) ** 2
@@ -146,9 +147,9 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflows, m, of a column of 10 m and of finite elements on four times as many cells.
+    """Return the outflow, m, of a column of 10 m: from `cells` cells, and from finite elements on four times as many.
 
-    The free surface is at 8 m at first; the head at the base is 2 m.
+    Initially the free surface is at 8 m; then the head at the base is 2 m.
     """
     high, head, h = 8.0, 2.0, 10.0 / cells
     grid = mpm.Grid([0, 0], [h, 10.0 + h], [1, cells + 1])
@@ -200,7 +201,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, dam: Dam) -> None:
-    """Draw pressures in steady flow, and all free surfaces."""
+    """Draw pressures in steady flow, and the free surfaces at all recorded times."""
     fig, axes = common.figure(2, 1, (9, 4.9))
     (corners, p), ax = dam.frames[0], axes[0, 0]
     domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(-WEIGHT * 2 / 1e3, WEIGHT * LEVELS[0] / 1e3))

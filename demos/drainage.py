@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Liakopoulos's column: saturated sand drains at its foot under gravity; suction contracts the sand, and it settles.
 
-A column of 1 m, initially in equilibrium with p = 0 everywhere, is opened at its foot.  Its retention curve is
-user-defined.  The effective stress uses chi p, with chi the saturation.  The reference is a converged solution with 400
-finite volumes, for small strain.  Source: Liakopoulos (1965), with the constants of Lewis and Schrefler (1998).
+In a column of 1 m, p = 0 everywhere at first, as in uniform downward flow.  Then no water enters at the top, and the
+column drains at its foot.  Its retention curve is user-defined.  The effective stress uses chi p, with chi the
+saturation.  The reference is a converged solution with 400 finite volumes, for small strain.  Source: Liakopoulos
+(1965), with the constants of Lewis and Schrefler (1998).
 
 Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the largest pressure at this
-time.  Errors of the settlement, and of the outflow at the foot, are relative.  On one process.
+time.  Other errors refer to the settlement, and to the outflow at the foot.  On one process.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ class Sand:
     """Del Monte sand."""
 
     def saturation(self, p):
-        """Return S as UFL."""
+        """Return the saturation S (UFL) at the pore pressure p, Pa."""
         return ufl.max_value(1 - 1.9722e-11 * ufl.max_value(-p, 0.0) ** 2.4279, 0.2)
 
     def relative_permeability(self, p):
-        """Return k_r as UFL."""
+        """Return the relative permeability k_r (UFL) at the pore pressure p, Pa."""
         return ufl.max_value(1 - 2.207 * ufl.max_value(1 - self.saturation(p), 1e-30) ** 1.0121, 0.0)
 
 
@@ -85,7 +86,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
-    """Draw pressures over the height and settlements over time, with the converged values."""
+    """Draw pressures against height and settlements against time, with the converged solution."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")

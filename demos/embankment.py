@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
 """An embankment under water is built in lifts on soft clay, and the clay consolidates.
 
-Half of the section (x = 0 is a plane of symmetry): 6 m of clay, and four lifts of 1 m with slopes of 1:2, one every 90
-days, followed by ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh).  A lift is placed on the
-settled ground and filled up to its design level, which compensates the settlement.  Pressures are excess pressures
-relative to the sea, and weights are buoyant.  The weight of the lifts is a term in UFL; the clay is in equilibrium with
-its own weight from the start.  The ground below a lift no longer drains at its surface; slope and crest of the lift are
-drained.  On one process.
+The scene is half of the section; x = 0 is a plane of symmetry.  On 6 m of clay, a lift of 1 m with slopes of 1:2 is
+built every 90 days.  After four lifts the clay consolidates for ten years.  Each lift is a polygon with named edges
+(`mpm.polygon`, by gmsh).  A lift is placed on the settled ground and filled up to its design level, so it is thicker
+than 1 m.  Pressures are in excess of the sea above, and weights are buoyant.  The weight of the lifts is a term in UFL;
+the clay is in equilibrium with its own weight from the start.  Each lift ends the drainage of the surface below, and is
+itself drained at its slope and crest.  On one process.
 
-Check: finally the lowest points of the clay carry the weight of the lifts, including the fill that compensates the
-settlement.  `carried` is the integral of the effective stress at these points, divided by this weight; it is 1 in
-equilibrium.
+Check: at the end the lowest points of the clay carry the weight of all lifts.  `carried` is the integral of the
+effective stress at these points, divided by this weight; it is 1 in equilibrium.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ BUOYANT = 0.6 * (2650 - 1000) * 9.81  # N/m^3
 
 @dataclass(frozen=True)
 class Weighed(mpm.Hencky):
-    """Hencky's law for soil with a buoyant weight, N/m^3, a field that the term `weight` uses."""
+    """Hencky's law, with a buoyant unit weight, N/m^3, stored on the points for the term `weight`."""
 
     unit_weight: mpm.Field = 0.0
 
     @staticmethod
     def energy(F, bulk, shear, unit_weight):
-        """Return psi, Pa, as UFL of F (d, d)."""
+        """Return the energy psi, Pa, in UFL; F (d, d): deformation gradient."""
         return mpm.Hencky.energy(F, bulk, shear)
 
 
@@ -53,7 +52,7 @@ SAND = Weighed(bulk=1e7, shear=6e6, conductivity=1e-6, unit_weight=lambda X: np.
 
 
 def weight(points, v):
-    """Return the work of the weights against a test function."""
+    """Return the work (UFL) of the buoyant weight along the test function v."""
     return points.unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
 
 
@@ -67,9 +66,10 @@ def lift(grid: mpm.Grid, k: int):
 
 @dataclass
 class Bund:
-    """Histories: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
+    """Histories: times (s), settlements of axis and toe (m), excess pressures (Pa) in the middle of the clay.
 
-    frames: title, corners (n, 4, 2), m, and excess pressures (n,), Pa; carried: see the module's docstring.
+    frames: sections at some times: title, corners (n, 4, 2), m, and excess pressures (n,), Pa.  carried: fraction of
+    the lifts' weight that the lowest points carry at the end.
     """
 
     t: list[float] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the embankment on cells of size h, m; steps: number between two lifts; after the last, 6 times as many."""
+    """Build the embankment on cells of size h, m, in `steps` steps a lift, and about 6 times as many after the last."""
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Error against run time, for material points and finite elements, in one run.
 
-Five cases have an exact or converged solution.  In each case, the runs with material points differ in cell size, points
-per cell, quadrature and coupling.  The finite elements are body-fitted: Q1/DG0 on the same grid, and Taylor-Hood.  The
-time is the shortest of `--repeat` runs of the time loop; compile times are separate.  Reference solutions are converged
-in space and in time.
+Five cases have an exact or converged solution.  In each case the demo varies the cell size, and for material points
+also the points per cell, the quadrature and the coupling.  Two body-fitted finite element methods are compared: Q1/DG0
+on cells of the same size, and Taylor-Hood.  The time is the shortest of `--repeat` runs of the time loop; compile times
+are separate.  Reference solutions are converged in space and in time.
 
-* beam: the poroelastic beam; largest error of the tip deflection over all output times `beam.TIMES`, and over the times
-  from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
-* drained: the same beam without water, load in ten steps; error of the tip deflection, against 67 x 20 Taylor-Hood
+* beam: the poroelastic beam; largest error of the tip deflection at all output times `beam.TIMES`, and at those from
+  0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
+* drained: the same beam without water, loaded in ten steps; error of the tip deflection against 67 x 20 Taylor-Hood
   elements
-* terzaghi: error of the settlement at T_v = 0.5, against the exact settlement
-* mandel: error of the plate's settlement at T = 0.1, against the exact settlement
-* column: error of the height of the soft column under its own weight, against the exact height
+* terzaghi: error of the settlement at T_v = 0.5, against the exact one
+* mandel: error of the settlement of the plate at T = 0.1, against the exact one
+* column: error of the height of the soft column under its own weight, against the exact one
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Row:
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of the beam, coupled or drained."""
+    """Yield (method, setting, run) of the beam, with water or (`drained`) without."""
     time = "--drained --ramp 1 --t-end 1 --dt 0.1" if drained else f"--t-end {0.4 if quick else 1.2}"
     times, truth = np.array(beam.TIMES), np.array(beam.TRUTH)
     if drained:
@@ -164,7 +164,7 @@ def scene_runs(
 
 
 def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield the runs of Terzaghi's column under a load that strains it by 1e-5."""
+    """Yield the runs of Terzaghi's column under a load that causes a strain of 1e-5."""
     cells = (5, 20) if quick else (5, 10, 20, 50)
     load = 1e-5 * terzaghi.SOIL.oedometric
     physics = {
@@ -179,7 +179,7 @@ def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
 
 
 def mandel_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield the runs of Mandel's slab of 1 m x 1 m (a quarter) at T = 0.1."""
+    """Yield the runs of a quarter of Mandel's slab, 1 m x 1 m, until T = 0.1."""
     soil = mpm.LinearElastic(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
     water = mpm.Fluid(bulk=np.inf)
     slab = Mandel(1.0, 1.0, soil.bulk, soil.shear, soil.conductivity / water.unit_weight, force=20.0)
@@ -219,7 +219,7 @@ CASES = {
 
 
 def measure(case: str, quick: bool, repeat: int) -> list[Row]:
-    """Run one case; the error of a failed run is nan."""
+    """Return the measured runs of one case; the error of a run that fails (`mpm.GaveUp`) is nan."""
     rows = []
     for method, setting, run in CASES[case](quick):
         try:
@@ -240,12 +240,12 @@ def measure(case: str, quick: bool, repeat: int) -> list[Row]:
 
 
 def time_at(rows: list[Row], error: float) -> float:
-    """Return the shortest time of runs with at most a given error; nan if there is no such run."""
+    """Return the shortest run time, s, of the runs with at most this error; nan if there is none."""
     return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
 
 
 def compare(rows: list[Row]) -> list[dict]:
-    """Return, for each default run, its time divided by that of finite elements: on the same grid, at equal error."""
+    """Return errors and time ratios of default runs, relative to finite elements on equal cells and at equal error."""
     out = []
     for r in (r for r in rows if r.method == DEFAULT):
         peers = [q for q in rows if q.case == r.case and q.method == PEER]
@@ -274,7 +274,7 @@ def table(comparison: list[dict]) -> list[list[str]]:
 
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
-    """Draw error against time: solid lines from coarse to fine cells, dashed lines from few to many steps."""
+    """Draw error against time; solid lines join runs of different cell size, dashed lines runs of different step."""
     fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows).most_common(1)[0][0]
     for method in dict.fromkeys(r.method for r in rows):

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Your own physics in a few lines of UFL: ten columns with exact solutions.
 
-A column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature: a stored energy,
-fibres with directions on the points, two conductivities that depend on the deformation, an elastic foundation, a source
-of fluid.  Others add a law with state variables, plastic flow, an implicit stress, and a return mapping in numpy.  The
-parameter names of a function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the
-package list all possible arguments.
+In each example, a column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature:
+a stored energy, fibres with a direction at each point, one of two conductivities that depend on the deformation, an
+elastic foundation, a source of fluid, a law with its own state variable, plastic flow, an implicit stress, or a return
+mapping in numpy.  The parameter names of a user function select its arguments.  `materials/skeleton.py` and
+`materials/user_functions.py` of the package list them.
 
 The error is the largest difference from the exact solution, divided by the largest exact value.  With 20 cells it is
-8e-4 for the energy, 6e-4 for fibres, 3e-3 for both conductivities, 6e-4 for the foundation and 5e-4 for the source.
-These errors decrease with the cell size.  The error of the damage is 1e-5, from the penalty of the prescribed
-displacement.  Plastic flow, the implicit stress and the return mapping have errors of at most 1e-11.
+8e-4 and 6e-4 for energy and fibres (layers are stretched in a single step), 3e-3 for both conductivities, 6e-4 for the
+foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error of the damage is 1e-5, because
+its prescribed top gives way a little.  Plastic flow, the implicit stress and the return mapping have errors of 1e-11.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> m
 
 @dataclass
 class Example:
-    """Result of a column: computed (n,) and exact (n,) values at the abscissae x (n,)."""
+    """Computed values (n,) and exact values (n,) of a column, at the abscissas x (n,)."""
 
     title: str
     xlabel: str
@@ -55,7 +55,7 @@ class Example:
 
     @property
     def error(self) -> float:
-        """Largest difference divided by the largest exact value."""
+        """Largest difference between computed and exact values, divided by the largest exact value."""
         return float(np.abs(self.found - self.exact).max() / np.abs(self.exact).max())
 
 
@@ -74,12 +74,12 @@ def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stretch(stress: Callable[[float], float]) -> float:
-    """Return the stretch at which a first Piola-Kirchhoff stress balances the load."""
+    """Return the stretch at which the first Piola-Kirchhoff stress, a function of the stretch, balances the load."""
     return brentq(lambda s: stress(s) + LOAD, 0.3, 2.0, xtol=1e-15)
 
 
 def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
-    """Return labels and values of an example: displacements of the points, exact for four layers of known stretches."""
+    """Return labels and values of an `Example`: displacements of the points; stretches: of four layers, exact."""
     Y, u = displacements(s)
     exact = np.interp(Y, np.linspace(0, 1, 5), np.concatenate([[0], np.cumsum(stretches - 1) / 4]))
     return "height at the start (m)", "displacement (m)", Y, u, exact
@@ -152,7 +152,7 @@ def of_strain(conductivity, J):
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Let water flow upwards through a column of two layers; the load mainly compresses the lower layer."""
+    """Let water flow upwards through a column of two layers, of which the load compresses the lower one more."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)
@@ -185,7 +185,7 @@ STIFFNESS = 4e6  # Pa/m per m of displacement: force per volume
 
 
 def foundation(points, u):
-    """Return the energy of springs between the points of the body and their initial positions."""
+    """Return the energy (UFL) of springs between the points of the body and their initial positions."""
     U = points.displacement + points.value(u)
     return STIFFNESS / 2 * ufl.inner(U, U) / ufl.det(points.F) * points.dx
 
@@ -206,7 +206,7 @@ RATE = 1e-7  # 1/s
 
 
 def source(points, q):
-    """Return a uniform source: volume of water per volume and time."""
+    """Return the form (UFL) of a uniform source of `RATE`: volume of water per volume of soil and time."""
     return RATE * q * points.dx
 
 
@@ -267,7 +267,7 @@ def damage(cells: int) -> Example:
 
 
 def plasticity(cells: int) -> Example:
-    """Load sand in an oedometer; `mpm_dolfinx/materials/drucker_prager.py` defines the law."""
+    """Load sand in an oedometer; the law is in `mpm_dolfinx/materials/drucker_prager.py`."""
     sand = mpm.DruckerPrager(bulk=1e7, shear=1e7, friction=20.0, dilation=5.0, cohesion=5e4)
     strain, stress = path(column(cells, sand, load=1e6), 20)
     shear = 2 * sand.shear / np.sqrt(3)  # growth of sqrt(J_2) with the compression; -p grows by K
@@ -283,7 +283,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """Pressure K y with y + power y^3 = ln J; Newton's method solves this equation at all points."""
+    """The pressure is K y; Newton's method solves y + power y^3 = ln J at each point, and the tangent is exact."""
 
     power: mpm.Field = 100.0
 

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Stiff and extreme scenes: each converges, recovers or is refused, and none is silently wrong.
 
-Every scene is small and has one extreme property.  The outcome is one of
+Every scene is tiny and has one extreme property.  Scenes with the same extreme property form a family.  Each scene has
+one of these outcomes:
 
-* converged: the error is below the bound of its family, compared with an exact solution, with finite elements, or with
-  the same scene at moderate values.  Both residuals and the error of the fluid balance are below 1e-8;
-* recovered: as converged, after cut steps;
-* refused: an error gives the reason; a scene without equilibrium must be refused;
-* warned: error above the bound, with a warning of the package;
-* wrong, nan or hung: a defect, reported by the exit status.
+* converged: the error against an exact solution, finite elements, or the same scene with a moderate setting is below
+  the bound of its family.  Both residuals and the error of the fluid balance are below 1e-8;
+* recovered: converged, but some steps were cut;
+* refused: the run ends with an error that gives the reason, as it must in a scene without equilibrium;
+* warned: the error is above the bound, and the package has issued a warning;
+* wrong, nan or hung: a defect, which the exit status reports.
 
-An error is relative to the largest exact value, unless the family defines another error.  The condition number is that
-of the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On one
-process.
+An error is relative to the largest exact value, unless its family defines another one.  The condition number refers to
+the last tangent of the momentum balance, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On
+one process.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """Outcome of a case: largest residual and error of the balance of its steps, total iterations."""
+    """Outcome of a case; largest residual and fluid balance error of all steps, and total numbers of iterations."""
 
     family: str
     setting: str
@@ -105,7 +106,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
 
 
 def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
-    """Compare a complete run with its reference."""
+    """Compare a completed run with its reference, and set outcome and error of the row."""
     s = scene.simulation
     row.condition = condition(s.scene.last[1].momentum.K)
     try:
@@ -122,7 +123,7 @@ def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
 
 
 def condition(K) -> float:
-    """Return the condition number of a matrix scaled to a unit diagonal; nan if none was needed."""
+    """Return the condition number of a matrix scaled to a unit diagonal; nan if there was no matrix."""
     if not K.assembled:
         return nan
     A = csr_matrix(K.getValuesCSR()[::-1], shape=K.getSize()).toarray()
@@ -132,7 +133,7 @@ def condition(K) -> float:
 
 
 def worst(rows: list[Row], name: str) -> float:
-    """Return the largest finite value of a column."""
+    """Return the largest value of the field `name` of all rows, without nan."""
     return max((v for r in rows if not isnan(v := getattr(r, name))), default=nan)
 
 
@@ -148,7 +149,7 @@ def table(head: list[str], rows: list[list]) -> str:
 
 
 def summary(rows: list[Row]) -> str:
-    """Return a row for each family: subject, bound, number of each outcome, and largest errors."""
+    """Return a table with a row for each family: subject, bound, number of cases by outcome, worst values."""
     names = ("error", "residual", "balance", "condition")
     lines = []
     for name, f in FAMILIES.items():
@@ -162,7 +163,7 @@ def summary(rows: list[Row]) -> str:
 
 
 def write(out: Path, rows: list[Row]) -> None:
-    """Write the tables."""
+    """Write the tables of all cases and of the families to the folder `out`."""
     head = [f.name for f in fields(Row)]
     common.write_csv(out / "cases.csv", head, (asdict(r).values() for r in rows))
     (out / "cases.md").write_text(table(head, [list(asdict(r).values()) for r in rows]) + "\n")
@@ -170,7 +171,7 @@ def write(out: Path, rows: list[Row]) -> None:
 
 
 def draw(out: Path, rows: list[Row]) -> None:
-    """Draw errors, condition numbers and Newton iterations per step of all cases, in one row for each family."""
+    """Draw errors, condition numbers, and Newton iterations per step of all cases, with one row for each family."""
     names = [name for name in FAMILIES if any(r.family == name for r in rows)]
     colours = dict(zip(OUTCOMES, ("C0", "C2", "0.5", "C1", "C3", "black", "C4"), strict=True))
     fig, (axes,) = common.figure(1, 3, (13, 1.5 + 0.34 * len(names)))

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A box slides, a ball rolls and a second ball bounces down an incline: distances against rigid-body motion, energies.
+"""A box slides, a ball rolls and a second ball bounces down an incline, compared with the motion of rigid bodies.
 
-The incline has an angle b = 30 degrees to the grid and friction mu = 0.3.  A rigid box slides by a distance
-(sin b - mu cos b) g t^2 / 2.  A rigid disc, with mu > tan b / 3, rolls by sin b g t^2 / 3.  A second disc falls on the
-incline from a height of one radius, bounces and rotates.  Box and discs consist of stiff rubber, and touch only the
-incline.  The final energy is the work of gravity, minus the dissipation by friction and the loss by waves.  Needs gmsh.
+The incline, 30 degrees to the grid, is rough, mu = 0.3.  b is its angle.  A rigid box slides by (sin b - mu cos b) g
+t^2 / 2 in the time t.  A rigid disc rolls by sin b g t^2 / 3, if mu > tan b / 3.  Another disc falls on the incline
+from a height of its own radius.  After the impact it bounces and rotates.  Box and discs are stiff rubber, and touch
+the incline only, not each other.  The final energy is the work of gravity, minus the energy that friction and elastic
+waves dissipate.  Needs gmsh.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ BOUNDS = {"slides": 0.005, "rolls": 0.01, "flies": 0.001, "energy": 0.03}
 
 
 def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
-    """Return box and balls above the incline, with a number of cells over a radius, and the points of each body."""
+    """Return the scene, with `cells` cells over a radius, and a mask (n,) of the points of each body."""
     h = RADIUS / cells
     size = np.array([2.3, 1.75])
     grid = mpm.Grid([0, 0], (np.ceil(size / h) * h).tolist(), np.ceil(size / h).astype(int).tolist())
@@ -49,7 +50,7 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 
 
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
-    """Release the bodies; return the run, times, s, with centres, m (times, 1 + 3 x 2), and some shapes."""
+    """Release the bodies; return the result, time, s, and three centres, m, as rows (times, 7), and some corners."""
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []
 
@@ -101,7 +102,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the moving shapes, the distances of these and of rigid bodies, and energies."""
+    """Draw the bodies at some times, their distances with those of rigid bodies, and the energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)

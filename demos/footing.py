@@ -1,44 +1,43 @@
 # SPDX-License-Identifier: MIT
-"""A strip footing is pushed into saturated soil to a depth of its width: fast, at an intermediate rate, and slowly.
+"""A strip footing is pushed into saturated soil, to a depth of its width, at three rates.
 
-Half of the rough, rigid footing of width B is computed, as a prescribed displacement on a part of the soil surface.
-The soil is a weightless layer, 2.5 B thick, on rough rock.  It follows the Drucker-Prager law with cohesion c, and
-drains at its free surface.  v is the velocity of the footing, and V = v B / c_v the ratio of penetration rate to
-consolidation rate.
+B is the width of the footing, which is rough and rigid.  By symmetry half of it is computed, as a prescribed
+displacement on a part of the soil's top.  The soil is a weightless layer 2.5 B thick on rough rock.  It follows Drucker
+and Prager's law with cohesion c, and drains at its free top.  The velocity v of the footing is given by V = v B / c_v,
+with the coefficient of consolidation c_v.
 
-A smooth, impervious wall stands 8 B from the middle.  With a wall at 16 B, loads change by less than 1 % at any depth
-and rate; the demo shows this on larger cells.  With a wall at 4 B, drained loads are up to 8 % too large before the
-limit load is reached.  The thickness of the layer also has an influence.  In plane strain the settlement grows with the
-logarithm of this thickness.  With a layer of 5 B, loads are 11 % lower at a settlement of 0.1 B, and 3 % lower at 0.5
-B.
+A smooth, impervious wall bounds the soil at 8 B from the middle of the footing.  With a wall at 16 B, loads change by
+less than 1 % at any depth and rate; the demo shows this on coarser cells.  With a wall at 4 B, drained loads are up to
+8 % too large while the soil yields below the footing, before the limit load.  The thickness of the layer matters.  In
+plane strain the settlement increases with the logarithm of this thickness, without bound.  With a layer 5 B thick,
+loads are 11 % smaller at a settlement of 0.1 B, and 3 % smaller at 0.5 B.
 
-Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c,
-N_c = (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Limit loads are computed for very stiff soil, which
-yields before the geometry changes.  Runs use --cells cells over the width, and about twice as many.
+Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c, N_c =
+(exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Limit loads are computed with very stiff soil, which flows
+before the geometry changes, on --cells cells over the width and on about twice as many.
 
-For deep penetration the soil does not dilate.  The undrained strength is s_u = xi c.  At depth D the limit load is (1 +
-0.27 sqrt(D/B)) times that at the surface (fit to bounds of limit analysis, Salgado et al. 2004).  The drained limit
-load at the surface lies between the load with Davis's (1968) reduced friction and B c N_c.
+In the deep push the soil does not dilate.  Its undrained strength is s_u = xi c.  A footing at depth D carries (1 +
+0.27 sqrt(D/B)) times the undrained load of a footing at the surface (fit to bounds of limit analysis, Salgado et al.
+2004). The drained capacity at the surface lies between the capacity for the reduced friction of Davis (1968) and c N_c.
 
-The undrained limit load converges from below, with order 1.5: errors of -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The
-last prescribed node also carries half a cell beyond the node, so an odd number of cells represents the true width.
-With 4, 8, 16 cells the last node lies at the edge of the footing, whose width is then too large by half a cell on each
-side.
+The undrained limit load converges from below, with order 1.5: its error is -6.7, -2.9, -1.1 % with 5, 9, 17 cells. The
+outermost node of the footing also carries half a cell beyond it, so an odd number of cells represents the true width.
+With 4, 8, 16 cells this node lies at the edge, and the footing is effectively wider by half a cell on each side.
 
-In associated flow each point of a cell must dilate with its own shear, but the cell has one mean dilatation.  The
-load would rise without limit (de Borst and Groen 1995), to errors of +4.4 and +3.4 % with 9 and 17 cells.  In fully
-yielding cells, laws therefore use half of the deviation of the gradient from the cell mean.  The errors are then -1.0,
-+0.2, +0.8 % with 5, 9, 17 cells.
+In associated flow the dilation of each point is proportional to its shear, but a cell has one mean dilatation.  The
+load would therefore increase without limit (de Borst and Groen 1995); its error in this demo would be +4.4 and +3.4 %
+with 9 and 17 cells.  In fully yielding cells, laws therefore use half of the deviation of the gradient from its mean.
+This reduces the error to -1.0, +0.2, +0.8 % with 5, 9, 17 cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
-With --graded, a fine box of 2 B x 0.75 B lies below the footing.  Outside this box, each cell is a tenth longer than
-its neighbour, up to eight times the length of the smallest cell.  A grid of 20 B x 10 B then has hardly more cells than
-a grid of 4 B x 2.5 B with fine cells only.
+With --graded, cells are fine in a region of 2 B x 0.75 B below the footing.  Outside this region, cells become longer
+by a tenth from one to the next, up to eight times the smallest length.  The 20 B x 10 B of soil then have hardly more
+cells than 4 B x 2.5 B with fine cells only.
 
-With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their place between
-steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are cut.  --viscosity adds a
-viscous shear resistance, small compared with the cohesion, which makes the solution unique (Needleman 1988).
+With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their position between
+steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are therefore cut.  The option
+--viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
 """
 
 from __future__ import annotations
@@ -96,16 +95,16 @@ SURFACE = {  # loads divided by B c; Davis: tan phi* = sin phi of the same stren
 
 
 def embedded(depth):
-    """Return the undrained limit load divided by B c; depth: depth of the base divided by B."""
+    """Return the undrained limit load, divided by B c, of a base at the depth `depth` (divided by B)."""
     return SURFACE["undrained"] * (1 + 0.27 * np.sqrt(depth))
 
 
 @dataclass
 class Frame:
-    """State of a run at one output time.
+    """State of footing and soil at one time of a push.
 
-    t: time divided by the duration of the penetration; settlement divided by B; corners of the domains, m; pressure of
-    the points, Pa; top (m, 2): surface of the soil from the middle outward, m.
+    t: time divided by the duration of the push.  settlement: divided by B.  corners (n, 4, 2), m, and pore pressure
+    (n,), Pa, of the domains.  top (m, 2): positions of the soil's surface, from the middle outward, m.
     """
 
     t: float
@@ -117,9 +116,11 @@ class Frame:
 
 @dataclass
 class Push:
-    """A run: settlement divided by B, load divided by B c; some frames; last step of penetration; results.
+    """Results of a push.
 
-    Heights are measured from the initial surface of the soil.
+    settlement, load: after each step, divided by B and by B c.  frames: states at some times.  pushed: index of the
+    last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the initial
+    surface of the soil.
     """
 
     settlement: list[float] = field(default_factory=lambda: [0.0])
@@ -129,7 +130,7 @@ class Push:
     results: list[mpm.Result] = field(default_factory=list)
 
     def total(self, name: str) -> float:
-        """Return the sum of a count of `Result`."""
+        """Return the sum of the field `name` of all results, such as the number of steps."""
         return sum(getattr(result, name) for result in self.results)
 
     @property
@@ -153,26 +154,12 @@ def push(
 ) -> Push:
     """Push the footing.
 
-    Parameters
-    ----------
-    soil, cells
-        The soil, and the number of cells over the footing's width, odd.
-    depth
-        Final depth, divided by B.
-    rate
-        V; None: soil without water.
-    box
-        Width and height of the computed half of the soil, divided by B.
-    rest
-        Time of consolidation after the penetration, divided by B²/c_v.
-    steps
-        Number of equal steps; by default computed from `STEP`.
-    circular
-        Whether the footing is a disc of diameter B instead of a strip.
-    method
-        Method of time integration.
-    graded
-        Whether the size of cells increases away from the footing.
+    Parameters ---------- soil, cells Soil, and number of cells over the footing's width, odd.  depth Depth of the push,
+    divided by B.  rate V = v B / c_v; None for a scene without water.  box Width and height of the computed half of the
+    soil, divided by B.  rest Time of consolidation after the push, divided by B²/c_v.  steps Number of equal steps of
+    the push; by default a step moves the footing by `STEP` cells.  circular Whether the footing is a disc of diameter B
+    instead of a strip.  method Method of time integration, see `Numerics`.  graded Whether cells become larger away
+    from the footing.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
@@ -213,9 +200,9 @@ def push(
 
 
 def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
-    """Push the footing into very stiff soil; the loads are divided by the theoretical limit load.
+    """Push the footing into very stiff soil; return the push, with loads divided by the theoretical limit load.
 
-    box, graded: see `push`; by default the box of `LIMITS_OF` with equal cells.
+    how: key of `LIMITS_OF`.  box, graded: see `push`; by default the box in `LIMITS_OF`, with equal cells.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own
@@ -278,9 +265,9 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def of_many_sizes(cells: int, folder: Path) -> dict:
-    """Print and draw the undrained limit load in a large box of graded cells and in a small one of equal cells.
+    """Print and draw the undrained limit load on graded cells in a large box, and on equal cells in a small box.
 
-    Returns this load with the points and the processor time, s.
+    Returns, for both boxes, the load, the number of points, and the processor time, s.
     """
     out, runs = {}, {}
     for how, box in FAR.items():
@@ -302,7 +289,7 @@ def of_many_sizes(cells: int, folder: Path) -> dict:
 
 
 def draw_cells(ax, frame: Frame) -> None:
-    """Draw the particle domains with pressures divided by the largest pressure."""
+    """Draw the particle domains, coloured by their pore pressures divided by c."""
     from matplotlib.collections import PolyCollection
 
     corners, p = frame.corners[:, [0, 1, 3, 2]], frame.pressure / COHESION
@@ -316,9 +303,9 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity, given relative to c times the duration of the penetration, s.
+    """Return the soil with the viscosity `viscosity` c t, where t = `seconds` is the duration of the push.
 
-    This relative viscosity is the additional shear strength, divided by c, at a shear strain of 1 in this duration.
+    A shear strain of 1 in this duration then increases the shear stress by `viscosity` c.
     """
     if viscosity == 0:
         return SOIL
@@ -327,9 +314,9 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
 
 
 def effort(cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0) -> dict:
-    """Push at the intermediate rate in equal steps; print and return the cost.
+    """Push at the intermediate rate in equal steps; print and return load, numbers of steps, and processor time.
 
-    width: width of half the soil, divided by B; viscosity: see `viscous`.
+    width: width of half the soil, divided by B.  viscosity: see `viscous`.
     """
     began, rate = time.process_time(), RATES["intermediate"]
     soil = viscous(viscosity, depth * WIDTH**2 / (CV * rate))
@@ -347,7 +334,7 @@ def effort(cells: int, depth: float, steps: int, width: float, method: str, visc
 
 
 def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
-    """Print and return the differences of the limit loads of stiff soil from the theory."""
+    """Print and return the relative errors of the limit loads of stiff soil against theory."""
     out = {}
     for (how, cells), run in stiff.items():
         out[f"{how}_{cells}"] = run.load[-1] - 1
@@ -358,7 +345,7 @@ def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
 
 
 def twice_the_box(cells: int, depth: float) -> dict[str, float]:
-    """Print and return the largest change of load in a box twice as wide, relative to `BOX` at the same depth."""
+    """Print and return, for each rate, the largest relative change of the load if the box is twice as wide as `BOX`."""
     out = {}
     for name, rate in RATES.items():
         near, far = (push(SOIL, cells, depth, rate, box=(wide * BOX[0], BOX[1])) for wide in (1, 2))
@@ -371,7 +358,7 @@ def twice_the_box(cells: int, depth: float) -> dict[str, float]:
 
 
 def report(runs: dict[str, Push]) -> dict:
-    """Print and return the results of all runs."""
+    """Print and return the results of the pushes at three rates."""
     out = {}
     for name, run in runs.items():
         out[name] = found = {
@@ -397,9 +384,9 @@ def report(runs: dict[str, Push]) -> dict:
 
 
 def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
-    """Draw pressures divided by c of two frames, as left and right half of the soil, and the footing.
+    """Draw the footing, and pore pressures / c of two frames, as left and right half of the soil.
 
-    Inverted domains at the edge of the footing have new corners; they leave white gaps.
+    White gaps at the edge of the footing are due to inverted domains that were replaced.
     """
     from matplotlib.collections import PolyCollection
 
@@ -424,12 +411,12 @@ def block(ax, frame: Frame) -> None:
 
 
 def scale(run: Push) -> tuple[float, float]:
-    """Return the colour limits for the pore pressure divided by the cohesion c in one run."""
+    """Return the limits of the colour scale for the pressures of a push, divided by c."""
     return 0.0, max(float(np.quantile(frame.pressure, 0.99)) for frame in run.frames) / COHESION
 
 
 def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -> None:
-    """Draw pressures, load against settlement, the surface of the soil, and limit loads of stiff soil."""
+    """Draw pressures, load against settlement, the soil's surface, and the limit loads of stiff soil."""
     fig, ((soil, curve), (surface, limit)) = common.figure(2, 2, (12, 7.5))
     run = runs["intermediate"]
     quads = view(soil, (run.at_end, run.frames[-1]), scale(run))
@@ -463,7 +450,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
 
 
 def draw_loads(ax, runs: dict[str, Push]) -> None:
-    """Draw load against settlement at all rates, and theoretical loads."""
+    """Draw load against settlement at all rates, and the theoretical limit loads."""
     for (name, each), colour in zip(runs.items(), COLOURS, strict=True):
         upto = each.pushed + 1
         ax.plot(each.settlement[:upto], each.load[:upto], color=colour, label=f"{name}, V = {RATES[name]:g}")

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
 """A rigid cylinder is pressed into a saturated gel and stays there; the force relaxes as the gel drains.
 
-In plane strain, half of the gel is computed.  The computed half is 5 m wide and 5 m high, lies on a smooth base,
-and drains at its side, far from the cylinder.  The cylinder moves down suddenly.
+The scene is in plane strain, and only half of the gel is computed, by symmetry.  This half is 5 m wide and high, lies
+on a smooth base, and drains at its side, far from the cylinder.  The cylinder moves down in the first step and is then
+held.
 
 * Initially no water has flowed, and the gel is incompressible.  The pressure under the cylinder is Hertz's,
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
-  with E* = 4 G of the undrained gel.  In a layer these formulas hold for the actual force F.
-* Finally the pore pressure has dissipated.  Hertz's formulas hold with E* = E / (1 - nu^2) of the drained gel.  The
+  with E* = 4 G of the undrained gel.  For a layer of finite height, these equations hold with the computed force F.
+* Finally the pore pressure has dissipated, and the contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
   force equals that on a dry gel, which the demo also computes.
 """
 
@@ -35,9 +36,9 @@ TIMES = np.geomspace(1e-4, 10, 21)  # times divided by this time, at which the f
 
 @dataclass
 class Contact:
-    """The contact at a time: force, N/m, and positions (m,), m, and pressures (m,), Pa, of points at the gel's surface.
+    """Contact at one time: force, N/m, and positions (m,), m, and pressures (m,), Pa, of points at the gel's surface.
 
-    most, half: largest pressure, Pa, and half-width, m, of the ellipse that fits them.
+    most, half: largest pressure, Pa, and half-width, m, of the ellipse fitted to these pressures.
     """
 
     force: float
@@ -47,7 +48,7 @@ class Contact:
     half: float
 
     def errors(self, stiff: float) -> tuple[float, float]:
-        """Return the relative errors of half-width and largest pressure for the force, E* in Pa."""
+        """Return the relative errors of half-width and largest pressure against Hertz for this force; stiff: E*, Pa."""
         half = 2 * np.sqrt(self.force * RADIUS / (np.pi * stiff))
         return self.half / half - 1, self.most / np.sqrt(self.force * stiff / (np.pi * RADIUS)) - 1
 
@@ -64,7 +65,7 @@ def contact(s: mpm.Simulation) -> Contact:
 
 
 def scene(cells: int, wet: bool) -> mpm.Simulation:
-    """Return half of the gel under the cylinder, with a number of cells per metre."""
+    """Return half of the gel under the cylinder, with `cells` cells per metre; wet: with pore water."""
     n, h = round(SIZE * cells), 1 / cells
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
     top = SIZE + 0.3 * h  # the surface is not on a grid line
@@ -85,10 +86,11 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 
 @dataclass
 class Pressed:
-    """A run.
+    """Results of a run.
 
-    contacts: initial and, in a saturated gel, final contact; forces: N/m, initially and at `TIMES`; frame: initial
-    corners, pore pressures and cylinder; balance: largest error of the fluid balance; cuts: number of cut steps.
+    contacts: initial contact and, if wet, final contact.  forces: N/m, initially and at `TIMES`.  frame: initial
+    corners, pore pressures, and shape of the cylinder.  balance: largest error of the fluid balance.  cuts: number of
+    cut steps.
     """
 
     contacts: list[Contact]
@@ -139,7 +141,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
-    """Draw initial pore pressures, pressures under the cylinder with Hertz's solution, and the force over time."""
+    """Draw initial pore pressures, contact pressures with Hertz's solution, and the force against time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Water infiltrates unsaturated soil, with exact and converged solutions.
+"""Water infiltrates unsaturated soil: comparison with exact and converged solutions.
 
-Left: rain on exponential soil (`Gardner`) above a water table.  The rain is a tenth of the conductivity until t = 0,
-and nine tenths of it after that.  Heads are compared with the series of Srivastava and Yeh (1991).  Right: a wetting
-front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  It is compared with a
-converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells with the same steps.
+The first scene is rain on exponential soil (`Gardner`) above a water table.  At t = 0 the rain increases from one to
+nine tenths of the conductivity.  Heads are compared with the series of Srivastava and Yeh (1991).  The second scene is
+a wetting front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  The front is
+compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells in the
+same steps.
 
-Errors for the rain: largest error of the head at 1, 6 and 12 h, divided by the largest head at this time.  Errors for
-the front, at 6 and 12 h, of material points and of finite elements: position of the head -5 m, and infiltrated volume.
-On one process.
+Errors for the rain, at 1, 6 and 12 h: the largest error of the head, divided by the largest head.  Errors for the
+front, at 6 and 12 h, of material points and of finite elements: the depth at which the head is -5 m, and the
+infiltrated water.  On one process.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
 
 
 def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> np.ndarray:
-    """Return the heads, m, at heights z after t (s), by the roots of tan(l L) + 2 l = 0 (Srivastava and Yeh 1991)."""
+    """Return the exact heads, m, at heights z, m, and time t, s, from the roots of tan(l L) + 2 l = 0."""
     Z, L, T = ALPHA * z, ALPHA, ALPHA * K * t / 0.35
     low = (np.arange(1, 200) - 0.5) * np.pi / L
     high = np.arange(1, 200) * np.pi / L
@@ -67,7 +68,7 @@ def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> 
 
 
 def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
-    """Return heights and heads of the cells at each of `HOURS`, the errors, and whether the run converged."""
+    """Return heights and heads of the cells, m, at each time of `HOURS`, the errors, and whether the run converged."""
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=K, retention=mpm.Gardner(WEIGHT / ALPHA))
     sides = [mpm.Drained("bottom"), mpm.Rain("top", 0.9 * K)]
     s = column(cells, soil, lambda x: WEIGHT / ALPHA * np.log(0.1 + 0.9 * np.exp(-ALPHA * x[:, 1])), sides)
@@ -83,7 +84,7 @@ def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
 
 
 def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
-    """Return depths and heads of cells at 6 and 12 h, errors of front, m, and water, and whether the run converged."""
+    """Return depths and heads, m, at 6 and 12 h, errors of front, m, and water, and whether the run converged."""
     s = column(cells, **DRY)
     start = s.cells().water.sum()
     found, places, waters = [], [], []
@@ -98,7 +99,7 @@ def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
 
 
 def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
-    """Return the errors of the front, m, and of the water, at 6 and 12 h, by finite elements on the same cells."""
+    """Return the errors of front, m, and water (relative) at 6 and 12 h, for finite elements on equal cells."""
     walls, pull = {"left": "x", "right": "x", "bottom": "y"}, lambda t: (0, -9.81)
     scene = {"conditions": DRY["sides"], "pressure": DRY["pressure"], "walls": walls, "gravity": pull}
     size = [0, 0], [1 / cells, 1], [1, cells]
@@ -140,7 +141,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heads: list, depths: list) -> None:
-    """Draw heads over the height with the series, and over the depth with the converged positions of the front."""
+    """Draw two diagrams: heads in rain with the series; heads of the front with its converged positions."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):

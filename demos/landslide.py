@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  The
-slope settles under its weight without inertia; the factor of safety is 1.4.  Then the strength is suddenly divided by
+A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  It
+settles under its weight without inertia, and its factor of safety is 1.4.  Then its strength is suddenly divided by
 1.6.
 
-With inertia the soil accelerates until its shape is stable, and moves further until friction stops the motion.  Without
+With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it.  Without
 inertia, as in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then
-stops at the first stable shape, so its run-out is shorter.  Friction dissipates the work of gravity, except for the
-change of elastic energy.
+stops at the first stable shape, so its run-out is shorter.  Energies balance: friction dissipates the work of gravity,
+except for the elastic part.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def slope(cells: int) -> mpm.Simulation:
 
 
 def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
-    """Divide the strength and let the slope slide; return the run, and the largest speed, m/s, at its output times."""
+    """Divide the strength and let the slope slide; return the result and the largest speeds, m/s, at output times."""
     friction = np.degrees(np.arctan(np.tan(np.radians(still.FRICTION)) / still.WEAKER))
     s.stage(inertia=True, fields={"friction": friction, "cohesion": still.COHESION / still.WEAKER})
     speeds = [0.0]

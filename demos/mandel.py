@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Mandel's slab: compressed between rigid plates, with a rise of pressure in the middle before drainage.
+"""Mandel's slab is compressed between rigid plates; the pore pressure in its middle rises before it decreases.
 
-In the first step a force acts on a saturated slab between rigid, smooth, impervious plates.  The free sides drain and
-soften first, so the load on the middle increases.  The pressure in the middle rises above its initial value p0 = force
-/ (2a).  This Mandel-Cryer effect occurs only with two-way coupling.  By symmetry a quarter is computed, a = 1 m wide
-and 1 m high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain
-theory is accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  The solution is linear over the height, so
-few cells suffice in this direction.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one
-process.
+A saturated slab between rigid, smooth, impervious plates takes a force in the first step.  Its free sides drain and
+soften first, so the plates load the middle more.  The pressure in the middle therefore rises above its initial value p0
+= force / (2a).  This Mandel-Cryer effect needs a two-way coupling.  By symmetry a quarter is computed, a = 1 m wide and
+1 m high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain theory
+is accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  Displacements are linear in y, so few cells over
+the height suffice.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
 
 Errors:
 
-* `p_0.01` to `p_1`: the largest error |p - exact| a / force of all cells, at centroids, at T = 0.01, 0.1, 0.5 and 1;
-* `p_max`: the relative error of the largest pressure in the innermost cell, which occurs at T = 0.07;
-* `p_rise`: the relative error of the rise of this pressure above p0, a stricter measure;
-* `settlement`: the largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.
+* `p_0.01` to `p_1`: largest value of |p - exact| a / force at the centroids of all cells, at T = 0.01, 0.1, 0.5 and 1;
+* `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07;
+* `p_rise`, a stricter measure: relative error of the difference between this highest pressure and p0;
+* `settlement`: largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.
 
 Most of the error is spatial, and decreases with the square of the cell size.
 """
@@ -41,9 +40,9 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 
 @dataclass
 class Outcome:
-    """Results of each step of a run: T, x (m) and p (Pa) of the cells (columns, rows), settlements (m).
+    """Results of a run, with an entry for each step: T, x, m, and p, Pa, of the cells (columns, rows), settlements, m.
 
-    Settlements of the top are given at eleven positions from the middle to the side.
+    Settlements are those of the top, at eleven positions from the middle to the side.
     """
 
     time: list[float] = field(default_factory=list)
@@ -53,12 +52,12 @@ class Outcome:
     stages: list[mpm.Result] = field(default_factory=list)
 
     def at(self, time: float) -> int:
-        """Return the index of the step that ends nearest to T."""
+        """Return the index of the step that ends nearest to the reduced time `time`."""
         return int(np.argmin(np.abs(np.array(self.time) - time)))
 
 
 def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[str, float], Outcome]:
-    """Consolidate the quarter to T = 1, with `steps` steps from 0 to the first of SAMPLES and between any two.
+    """Consolidate the quarter until T = 1, with `steps` equal steps up to each time of SAMPLES.
 
     Returns the errors that the module's docstring defines, and the histories.
     """
@@ -91,7 +90,7 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
 
 
 def exact_peak(x: float) -> float:
-    """Return the largest pressure at a position at any time, Pa."""
+    """Return the largest exact pressure, Pa, over all times, at the position x, m."""
     return float(EXACT.pressure(x, np.geomspace(1e-3, 1, 5001) * WIDTH**2 / EXACT.cv).max())
 
 
@@ -127,7 +126,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the width, and the pressure in the middle over time, with the exact curves."""
+    """Draw the pressure against x, and the pressure in the middle against time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     unit, scale, x = WIDTH**2 / EXACT.cv, FORCE / WIDTH, np.linspace(0, WIDTH, 201)
     for i, k in enumerate(map(out.at, SAMPLES)):

@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""A T-bar, a rigid cylinder, is pushed sideways through clay, deep below the surface.
+"""A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is undrained and follows von Mises's law, with strength s_u in plane strain.  The bar is embedded in the clay
-at the start, and is pushed until the clay flows around the bar.  For adhesion alpha s_u on the bar, the resistance is
-then that of Randolph and Houlsby (1984),
+The clay is undrained, and follows von Mises's law, with strength s_u in plane strain.  The bar starts inside the clay
+and is pushed until the clay flows all around it.  Then the resistance of the bar is that of Randolph and Houlsby (1984)
+for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-Half of a block of clay, eight diameters wide and high, lies between smooth walls.  A pressure on the top prevents a gap
-behind the bar.  The clay settles under this pressure, and therefore first loads the bar downwards.  In a narrower block
-the resistance is lower: for a rough bar in a block four diameters wide, N is 10.9 and 10.8 with 8 and 16 cells over the
-diameter.
+The clay is a block, eight diameters wide and high, between smooth walls; half of it is computed.  A pressure on its top
+keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.
+In a narrower block the resistance is lower.  With four diameters, N of a rough bar is 10.9 and 10.8 with 8 and 16 cells
+over the diameter.
 
-Clay ahead of the bar flows around the bar and stretches exponentially, by about e^4 in a penetration of one diameter.
-After each quarter of a diameter, new particle domains are therefore seeded around the bar, with the present stresses
-(remeshing and interpolation: Hu and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  The stress is the only
-state variable of this clay.  After each new seeding, N is lower for one or two steps.  Errors refer to the mean of N in
-the last part of each quarter, and `spread` is the variation of N in this part.
+Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  The clay is therefore
+seeded again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu
+and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each new
+seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter.  `spread`
+is the variation of N in these parts.
 
-In saturated clay a smooth bar is pushed by one diameter, at three rates V = v D / c_v.  The water pressure on top
-equals the applied total pressure, so the clay has no initial effective stress.  Saturated clay is seeded only once.
-Domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as the
-others.
+Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
+c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
+once.  Its domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as
+the others.
 
-With --follow the bar is pushed once more, on small cells that move with the bar.  The number of grid lines does not
-change: larger cells become wider behind the bar and narrower ahead of the bar.
+With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
+larger cells widen behind the bar and narrow ahead of it.  The number of cells does not change.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ FINE_ZONE, RATIO = 1.0, 1.3  # m: region of small cells around the bar; ratio of
 
 
 def exact(alpha: float) -> float:
-    """Return N of Randolph and Houlsby."""
+    """Return the resistance N of Randolph and Houlsby for the roughness alpha."""
     delta = np.arcsin(alpha)
     half = np.pi / 4 - delta / 2
     return np.pi + 2 * delta + 4 * np.cos(half) * (np.sqrt(2) + np.sin(half))
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between domains; nose: width of domains ahead of the bar, divided by the others."""
+    """Return the angles between domains around the bar; ahead of it, at angle 0, widths are `nose` times the others."""
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -77,9 +77,9 @@ def angles(around: int, nose: float) -> np.ndarray:
 
 
 def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
-    """Return the grid, with a number of cells over the diameter, half of the block around a bar at y, m, and its top.
+    """Return the grid, half of the block around a bar at the height y, m, and the region of the block's top.
 
-    follow: the bar, if grid lines follow it.
+    cells: number of cells over the diameter.  nose: see `angles`.  follow: the bar, if grid lines follow it.
     """
     h = D / cells
     n = round(HALF * cells)
@@ -105,11 +105,11 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
 @dataclass
 class Push:
-    """Steps of a run: depths divided by D, resistances N, whether N is used, excess pressures divided by s_u.
+    """Results by step: depths / D, resistances / (s_u D), whether errors include them, and excess pressures / s_u.
 
     frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
-    displacement of the points since the last seeding, divided by that of the bar.  In saturated clay the field is the
-    excess pressure divided by s_u.  lines: final grid lines along both axes, m.
+    displacement of the points since the clay was seeded, divided by that of the bar; in wet clay the excess pressure
+    divided by s_u.  lines: final grid lines along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -124,7 +124,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Load the clay, then push a bar of roughness alpha; depth: divided by D; new domains are seeded in each part.
+    """Load the clay, then push a bar of roughness alpha to `depth` diameters; the clay is seeded again in each part.
 
     follow: whether grid lines follow the bar.
     """
@@ -135,7 +135,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar from y by a distance (divided by D), with given stresses or in loaded clay; return final stresses."""
+    """Push a bar from y D by `way` D, with initial stresses `stress`, or after loading; return the final stresses."""
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
@@ -161,7 +161,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return the effective stress (n, 3, 3), Pa, interpolated to positions x (n, 2) and limited by the strength."""
+    """Return a function of positions x (n, 2), m: interpolated effective stress (n, 3, 3), Pa, within the strength."""
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
     between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
@@ -179,7 +179,7 @@ def kept(simulation: mpm.Simulation) -> Callable:
 
 
 def push_wet(rate: float, cells: int, depth: float) -> Push:
-    """Push a smooth bar into saturated clay at a rate V; depth: divided by D."""
+    """Push a smooth bar by `depth` diameters into wet clay, at the rate V = `rate`."""
     grid, body, top = clay(cells, NOSE)
     speed = rate * CV / D  # m/s
     start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
@@ -271,7 +271,7 @@ def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
 
 
 def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
-    """Draw resistances, displacements of the clay around the smoothest and the roughest bar, and pore pressures."""
+    """Draw resistances, displacements of the clay around smoothest and roughest bar, and pore pressures in wet clay."""
     fig, axes = common.figure(2, 4, (17, 8.5))
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
@@ -297,7 +297,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
 
 
 def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the last frame of a run, with its field."""
+    """Draw the final state of a push, coloured by the field of its frame."""
     corners, values, bar = run.frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """A poroelastic beam of 1 m x 0.3 m: a saturated cantilever under a constant load.
 
-A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load rises linearly
-over the ramp and then remains constant.  The ends of the beam are permeable, and its long sides are no-flow.  The beam
-is in plane strain, or equivalently in 3D, 0.1 m deep between smooth walls (--dim 3).  At first the pore water carries a
-part of the load.  As the beam drains, the tip deflection reaches a third of the length.  Two other solutions are shown.
-The first is the small-strain Euler-Bernoulli beam without water.  The second (--reference) solves the same
-finite-strain Biot problem with Taylor-Hood elements on a body-fitted mesh, in steps of a quarter of --dt.
+A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load increases linearly
+until the end of the ramp (--ramp), and then remains constant.  The ends of the beam are permeable, and its long sides
+are no-flow.  The beam is in plane strain, or equivalently 0.1 m deep between smooth walls (--dim 3).  At first the pore
+water carries a part of the load.  The beam drains and sags by a third of its length.  Two other solutions are drawn.
+One is Euler-Bernoulli's small-strain beam without water.  The other (--reference) solves the same finite-strain Biot
+problem with body-fitted Taylor-Hood elements, in steps of a quarter of --dt.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def arguments(argv: list[str] | None = None) -> Namespace:
 
 
 def physics(o: Namespace, dim: int = 2) -> dict:
-    """Return the common boundary conditions and fluid of material points and finite elements."""
+    """Return boundary conditions and fluid, which are the same for material points and finite elements."""
     inner = [np.inf] * (dim - 1)
     load = mpm.Traction(
         "top",
@@ -90,12 +90,12 @@ def physics(o: Namespace, dim: int = 2) -> dict:
 
 
 def material(o: Namespace) -> mpm.Hencky:
-    """Return the soil skeleton of the beam."""
+    """Return the constitutive law of the skeleton."""
     return mpm.Hencky(bulk=o.bulk, shear=o.shear, porosity=o.porosity, conductivity=o.conductivity)
 
 
 def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
-    """Return the simulation and the height of the beam's underside."""
+    """Return the simulation, and the height of the beam's lower side on the grid, m."""
     cells = np.rint(BOX / o.h).astype(int)
     h = BOX / cells
     # a larger box reaches as far below the beam as above it, by whole cells: the beam lies on the grid as before
@@ -116,7 +116,7 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
 
 
 def output_times(o: Namespace) -> dict:
-    """Return the steps and output times for `run`: equal steps, or TIMES with adaptive steps."""
+    """Return arguments of `run`: the length of equal steps, or `rtol` and the output times TIMES of adaptive steps."""
     if o.rtol is None:
         return {"dt": o.dt}
     return {"rtol": o.rtol, "t_eval": [t for t in TIMES if t <= o.t_end]}
@@ -167,7 +167,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
-    """Return the finite element result at the times of another result, for positions (n, 2), m, on the axis."""
+    """Return the finite element result at the times of `result`, for positions `axis` (n, 2), m, on the beam's axis."""
     fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
     at = [int(np.argmin(np.abs(found.t - t))) for t in result.t]
@@ -228,7 +228,7 @@ def write_tables(o: Namespace, axis: np.ndarray, result: mpm.Result, fem) -> Non
 
 
 def draw_pressure(o: Namespace, snapshots: list) -> None:
-    """Draw the pore pressure of the material points at six times, with one colour scale."""
+    """Draw the pore pressure of the material points at six times, all with the same colour scale."""
     from matplotlib.colors import SymLogNorm
 
     rows = 1 + (len(snapshots) > 3)
@@ -249,7 +249,7 @@ def draw_pressure(o: Namespace, snapshots: list) -> None:
 
 
 def draw_deflection(o: Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
-    """Draw the axis of the beam at several times, with the Euler-Bernoulli beam and the finite elements."""
+    """Draw the beam's axis at several times, with Euler-Bernoulli's beam and the finite elements."""
     import matplotlib
 
     fig, ((ax,),) = common.figure(1, 1, (8, 5))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Exact integration over particle domains: tip deflection of the drained beam against the number of load steps.
+"""Exact integration over particle domains: tip deflection of the drained beam for different numbers of load steps.
 
-The beam of `poroelastic_beam.py` without water is loaded in n equal steps.  The material is elastic, so the deflection
-must not depend on n.  With exact integration over particle domains, the deflection does not depend on n.  With point
-quadrature, as in standard MPM, the error of the deflection grows with every cell that a point crosses.  The finite
-element reference is computed in ten load steps.
+The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material is elastic, so the
+deflection must not depend on n.  This is true with integration over the exact pieces of the domains.  With integration
+at the points, as in standard MPM, the deflection has an additional error with every cell that a point crosses.  The
+finite element reference takes the load in ten steps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROBE = np.array([[beam.LENGTH, beam.HEIGHT / 2]])
 
 
 def tip(h: float, steps: int, quadrature: str) -> tuple[float, float]:
-    """Return (tip deflection, m, wall time, s); the deflection is nan if the run failed."""
+    """Return the deflection of the tip, m, and the run time, s; the deflection is nan if the run failed."""
     o = options(h, steps, quadrature)
     simulation, bottom = beam.scene(o)
     try:

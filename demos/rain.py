@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Rain on slopes that suction stabilises: factors of safety in time, with exact limits, and a bank that slides.
+"""Rain on slopes that suction stabilises: factors of safety against time, and a bank that slides.
 
-A slope of 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  The scene is a
-column above a water table 5 m below the surface, under the component of gravity normal to the slope, initially in
-equilibrium.  Then vertical rain, at nine tenths of the conductivity, falls until the flow is steady.  At a vertical
-depth d the factor of safety is
+A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  A column
+stands on a water table 5 m below the surface, under the component of gravity normal to the slope.  The column starts at
+rest.  Then vertical rain, nine tenths of the conductivity, falls until the flow is steady.  At a vertical depth d the
+factor of safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
 
-with the suction stress chi s of Bishop and a constant unit weight gamma.  The suction s in exponential soil is known
-before the rain, and in steady rain q at a height z above the water table: exp(-alpha s / gamma_w) = q / k + (1 - q / k)
-exp(-alpha z cos^2 b).
+with the suction stress chi s of Bishop and a constant unit weight gamma.  At rest and in steady flow the suction s of
+exponential soil is known exactly: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), where q is the
+rain, k the conductivity, and z the height above the water table.
 
-Source: Lu and Godt (2008) for vertical flow; for flow normal to the slope, gravity is replaced by its normal component.
-Errors: the largest error of FS at 1, 2, 3 and 5 m, before the rain and in steady rain.
+Source: Lu and Godt (2008) for vertical flow; here the component of gravity normal to the slope replaces gravity.
+Errors: the largest error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
 
-With `--slope 10` rain falls on a bank of soil on rough rock, 5 m high, at 60 degrees.  Suction and a cohesion that
-vanishes with slip stabilise the bank.  The suction decreases until equilibrium is impossible.  With inertia the bank
-then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks: energy balance
-and water balance.  With 6 and 10 cells over its height, the bank fails after 1.7 and 1.5 h, with run-outs of 3.2 and
-2.7 m.  On one process.
+With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and a
+cohesion that vanishes with slip stabilise the bank.  The suction decreases until equilibrium is impossible.  With
+inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks:
+balances of energy and water.  With 6 and 10 cells over its height, the bank fails after 1.7 and 1.5 h, and runs out by
+3.2 and 2.7 m.  On one process.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def column(cells: int) -> mpm.Simulation:
 
 
 class Shot(NamedTuple):
-    """Time, s, corners of the domains, m, their saturation, and the largest speed, m/s."""
+    """State of the bank: time, s, corners of the domains, m, their saturations, and the largest speed, m/s."""
 
     t: float
     corners: np.ndarray
@@ -101,7 +101,7 @@ def bank(cells: int) -> mpm.Simulation:
 
 
 def slide(o: Namespace) -> dict:
-    """Let the bank fail and run out; return its results, and draw it."""
+    """Run the bank in the rain until it has failed and come to rest; draw it, and return the results."""
     s = bank(o.slope)
     start = float(s.cells().water.sum())
     film = [shot(s)]
@@ -136,13 +136,13 @@ def slide(o: Namespace) -> dict:
 
 
 def shot(s: mpm.Simulation) -> Shot:
-    """Return the present state of the bank for a picture."""
+    """Return the present state of the bank."""
     speed = np.linalg.norm(s.points.data["velocity"], axis=1).max() if "velocity" in s.points.data else 0.0
     return Shot(s.t, s.points.corners.copy(), s.point_fields().saturation, float(speed))
 
 
 def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
-    """Draw the bank before the rain, at failure and at the end, and an animation; rained: states up to failure."""
+    """Draw the bank before rain, at failure and at rest, and an animation; rained: number of states until failure."""
     fig, (panels,) = common.figure(1, 3, (13, 3.2))
     failed = film[rained - 1].t
     titles = ("before the rain", f"{failed / 3600:.1f} h: it fails", f"{film[-1].t - failed:.0f} s later")
@@ -155,7 +155,7 @@ def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
 
 
 def bank_in(ax, one: Shot):
-    """Draw a state of the bank; return the collection of domains."""
+    """Draw a state of the bank; return matplotlib's collection of the domains."""
     import matplotlib.pyplot as plt
 
     cmap = plt.get_cmap("viridis_r", 9)  # few colours: a small animation
@@ -195,13 +195,13 @@ def animate(path: Path, film: list[Shot], rained: int) -> None:
 
 
 def exact(depth: np.ndarray, share: float) -> np.ndarray:
-    """Return the exact factors of safety at depths (m), for a rain given as a fraction of the conductivity."""
+    """Return the exact factors of safety (n,) at depths (n,), m; share: rain divided by the conductivity."""
     filled = share + (1 - share) * np.exp(-ALPHA * (TABLE - depth) * np.cos(SLOPE) ** 2)
     return safety(depth, -filled * np.log(filled) / ALPHA * WATER)
 
 
 def safety(depth: np.ndarray, suction_stress: np.ndarray) -> np.ndarray:
-    """Return the factors of safety at depths (m), from the suction stress chi s (Pa)."""
+    """Return the factors of safety (n,) at depths (n,), m, from the suction stresses chi s (n,), Pa."""
     angles = np.tan(SLOPE) + 1 / np.tan(SLOPE)
     held = 2 * COHESION / (UNIT * depth * np.sin(2 * SLOPE)) + np.tan(FRICTION) / np.tan(SLOPE)
     return held + suction_stress / (UNIT * depth) * angles * np.tan(FRICTION)
@@ -217,7 +217,7 @@ def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
-    """Return the largest error of the factors of safety at `DEPTHS`; the suction at the water table is zero."""
+    """Return the largest error of the factors of safety at `DEPTHS`; the suction is zero at the water table."""
     at = np.interp(DEPTHS, np.append(depth, TABLE), np.append(suction_stress, 0.0))
     return float(np.abs(safety(DEPTHS, at) / exact(DEPTHS, share) - 1).max())
 
@@ -262,7 +262,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list) -> None:
-    """Draw heads and factors of safety over the depth, with exact values before the rain and in steady rain."""
+    """Draw heads and factors of safety against depth, with exact curves at rest and in steady flow."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for days, depth, head, felt in curves:
         left.plot(head, depth, lw=1.4, label=f"{days:g} d")

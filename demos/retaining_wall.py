@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""A rigid retaining wall tilts about its toe, away from the sand or into it: active and passive pressure.
+"""Active and passive pressure on a rigid retaining wall that tilts about its toe, away from the sand or into it.
 
 The sand carries a surcharge q and is weightless; phi = psi = 30 degrees.  It lies on a rough floor, and the friction
-angle of the wall is delta.  The wall tilts until a wedge of sand yields; the pressure normal to the wall is then K q.
-The effect of cohesion is removed by adding c cot(phi) to both pressures.  The exact coefficient is
+angle of the wall is delta.  The wall tilts until a wedge of the sand flows.  The normal pressure on the wall is then K
+q, if c cot(phi) is added both to this pressure and to q, which removes the effect of cohesion, with
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
-with the upper signs for passive pressure.  The solution consists of a zone at the wall, a fan about the crest of the
-wall, and Rankine's zone (Prandtl, Sokolovskii).  Without friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1
-∓ sin(phi)).  Coulomb's K is that of the critical wedge with a plane slip surface.
+where the upper sign is for passive pressure.  The flowing sand consists of a zone at the wall, a fan about the crest of
+the wall, and Rankine's zone (Prandtl, Sokolovskii).  Without friction, delta = 0, this is Rankine's K = (1 ± sin(phi))
+/ (1 ∓ sin(phi)).  Coulomb's solution is the critical wedge with a plane slip surface.
 
-K is also computed from the moment about the toe.  No gap opens at the toe of a tilting wall.  A translating wall opens
-a gap at its toe, and the lowest of ten cells carries no load: the active thrust is a tenth too small.  The sand is
-stiff.  At two and a half times the tilt of this demo, the active thrust is 2.5 to 3 % larger.
+The moment about the toe, which is work-conjugate to the rotation, also gives K.  A tilting wall opens no gap at its
+toe.  A translating wall opens a gap and carries nothing there: without the last of ten cells, the active thrust is a
+tenth too small.  The sand is stiff, so that it flows at a small tilt.  At two and a half times this tilt, the active
+thrust is 2.5 to 3 % larger.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ STEPS = {"active": 5, "passive": 12}
 
 
 def exact(delta: float, way: int) -> float:
-    """Return K for friction delta, degrees, active (-1) or passive (1)."""
+    """Return the exact K for a wall with friction angle delta, degrees; way: -1 for active, 1 for passive."""
     p, d = np.radians([PHI, delta])
     w = np.arcsin(np.sin(d) / np.sin(p)) + way * d
     return (1 + way * np.sin(p) * np.cos(w)) / (1 - way * np.sin(p)) * np.exp(way * w * np.tan(p))
 
 
 def coulomb(delta: float, way: int) -> float:
-    """Return K of Coulomb's critical wedge."""
+    """Return K of Coulomb's wedge, for the same parameters."""
     (p, d), angle = np.radians([PHI, delta]), np.radians(np.linspace(5, 85, 8001))
     K = np.cos(d) / np.tan(angle) * np.tan(angle + way * p)
     K /= np.cos(d) - way * np.sin(d) * np.tan(angle + way * p)
@@ -63,7 +64,10 @@ def slip_line(delta: float, way: int) -> np.ndarray:
 
 @dataclass
 class Tilted:
-    """A run: tilts (n,), rad; K from the thrust and from the moment (n,); corners, plastic shear strains, the wall."""
+    """Results of a run: tilts (n,), rad, and K (n,) from the thrust and from the moment.
+
+    frame: final corners of the domains, m, plastic shear strains, and shape of the wall.
+    """
 
     tilt: np.ndarray
     thrust: np.ndarray
@@ -119,7 +123,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[tuple[str, float], Tilted]) -> None:
-    """Draw the yielding sand with its exact edge, and K against the tilt of the wall."""
+    """Draw the flowing sand with its exact boundary, and K against the tilt."""
     fig, axes = common.figure(len(runs), 2, (12, 2.5 * len(runs)))
     for (left, right), ((name, delta), run) in zip(axes, runs.items(), strict=True):
         corners, strain, wall = run.frame

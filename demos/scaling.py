@@ -1,31 +1,31 @@
 # SPDX-License-Identifier: MIT
-"""Cost of a step: time of each part, memory and messages against the number of material points and processes.
+"""Cost of a step: time of each part, memory, and messages, for different numbers of material points and processes.
 
 Two saturated bodies move slowly through the grid.  One is the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
-background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Every run
-has its own process, or several processes under mpirun (--processes 1 2).  The first step compiles forms and fills
-caches. Then single steps are measured, and the fastest is used, because other work on the machine only increases times.
-Times are processor times; the times of parts are in proportion to wall times.  On several processes, the largest time
-of all processes is used, including waits.  Memory is the peak since the start of the process, with libraries and
-compiler.  If the demo itself is started by mpirun, all runs use the same processes, and memory is the peak of all runs
+background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Each run is
+a new process, or several processes under mpirun (--processes 1 2).  The first step compiles and fills the caches.  Then
+single steps are measured, and the fastest step is used, since other work on the machine only adds time.  Time is
+processor time, divided among the parts of a step in proportion to their wall time.  On several processes, the time is
+the largest of all processes, including waiting.  Memory is the peak since the start of the process, including libraries
+and compiler.  If the demo itself is started by mpirun, all runs share its processes, and memory is the peak of all runs
 so far.
 
-The exponent of a part is the slope of log(time) against log(points), a least-squares fit to the upper half of the
-sizes. The slope of the memory, `kB a point`, is a fit to all sizes, by least squares of relative errors.  Runs on
-several processes also print `imbalance`, the largest number of pieces of a process divided by the mean.  They print the
-traffic of a step, the largest of all processes.  `exchange` is the traffic of the package (pieces, corners, points).
-`solvers` is PETSc's count in set-up and solution of its Krylov solvers.  Messages of MUMPS and of dolfinx are not
-counted.
+The exponent of a part is the slope of log(time) against log(points), fitted by least squares to the larger half of the
+sizes.  `kB a point` is the slope of the memory against the points, fitted to all sizes by least squares of relative
+errors.  Runs on several processes also print the load balance (`imbalance`: largest number of pieces of a process
+divided by the mean) and the messages of a step on the process with the most.  `exchange` are the messages of the
+package (pieces, corners, points).  `solvers` are the messages that PETSc counts in set-up and solution of its Krylov
+solvers.  Messages of MUMPS and of dolfinx are not counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
 
     T = e + a n / P + b H + c log2 P,
 
-e is a fixed cost, a n / P the work of the points (multiplied by the imbalance of the run), b H the halo.  Messages cost
-c log2 P.  All coefficients are >= 0, from least squares of relative errors.  H is the number of points along the faces
-between processes, for a cube that is divided into halves repeatedly.  If a run has more processes than the machine has
-processors, its message counts are used, but not its times.  In 2D the model excludes the solvers, because the cost of
-factorisations is not proportional to n / P.
+where the terms are a fixed cost, the work for the points (in a measured run, times its imbalance), the work for the
+halo, and messages of any size.  The coefficients, all >= 0, are fitted by least squares of relative errors.  H is the
+number of points along the faces between processes, for a cube that is halved repeatedly.  If a run has more processes
+than the machine has processors, its message counts are used, but not its times.  In 2D the model excludes the solvers,
+because the cost of factorisations is not proportional to n / P.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ SOLVERS = ("factorisation", "linear solve")
 
 
 def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
-    """Return a scene with about a given number of points, and its time step, s."""
+    """Return the scene of a body with about `points` points, and its time step, s."""
     if dim == 2:
         h = np.sqrt(4 * beam.LENGTH * beam.HEIGHT / points)
         return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02
@@ -84,14 +84,14 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
 
 
 def sent() -> np.ndarray:
-    """Return numbers so far: messages and bytes of exchanges; messages, bytes and reductions of solvers."""
+    """Return numbers of messages and bytes of exchanges so far, and of messages, bytes and reductions of solvers."""
     events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
     solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
 
 
 def measure(dim: int, points: float) -> dict:
-    """Return the costs of the fastest step of a run.  All processes must call this function."""
+    """Return the costs of the fastest step of a run; all processes must call this function."""
     PETSc.Log.begin()
     began = time.perf_counter()
     simulation, dt = scene(dim, points)
@@ -128,7 +128,7 @@ def measure(dim: int, points: float) -> dict:
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
-    """Return the result of `measure`, run in one or several new processes."""
+    """Return the result of `measure`, run in a new process or in several."""
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
@@ -144,7 +144,7 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return exponents of the parts, fitted to the upper half of the sizes, and the memory: MB, and kB per point."""
+    """Return the exponents of the parts for the larger half of the sizes, and the memory: initial MB, kB per point."""
     upper = rows[(len(rows) - 1) // 2 :]
     n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
     slope, base = np.polyfit(n, memory, 1, w=1 / memory)
@@ -157,7 +157,7 @@ def exponents(rows: list[dict]) -> dict[str, float]:
 
 
 def halo(dim: int, n: float, processes: int) -> float:
-    """Return the number of points along the faces that a process shares with others; processes: a power of two."""
+    """Return the number of points along faces that a process shares with others; processes: a power of two."""
     turn = round(np.log2(processes))
     halved = np.array([turn // dim + (axis < turn % dim) for axis in range(dim)])
     sides = n ** (1 / dim) / 2.0**halved
@@ -165,17 +165,17 @@ def halo(dim: int, n: float, processes: int) -> float:
 
 
 def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[float]:
-    """Return the terms of the cost model."""
+    """Return the terms of the cost model, which the coefficients multiply: 1, n / P, H, log2 P."""
     return [1.0, imbalance * n / processes, halo(dim, n, processes), np.log2(processes)]
 
 
 def modelled(row: dict) -> float:
-    """Return the time of a step, s, to which the cost model is fitted."""
+    """Return the time of a step, s, to which the cost model is fitted: in 2D without the solvers."""
     return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
 
 
 def fit(rows: list[dict]) -> dict[str, float]:
-    """Return the coefficients of the cost model, s, and its largest relative error on the runs."""
+    """Return the fitted coefficients of the cost model, s, and the largest relative error for the runs."""
     timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
     A = np.array([terms(row["dim"], row["points"], row["processes"], row["imbalance"]) for row in timed])
     T = np.array([modelled(row) for row in timed])
@@ -185,7 +185,7 @@ def fit(rows: list[dict]) -> dict[str, float]:
 
 
 def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> float:
-    """Return the predicted time of a step, s."""
+    """Return the time of a step, s, that the cost model predicts."""
     return float(np.dot(terms(dim, n, processes), [model[name] for name in "eabc"]))
 
 
@@ -193,7 +193,7 @@ def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> fl
 
 
 def by_part(rows: list[dict], found: dict[str, float]) -> str:
-    """Return the seconds and the memory of runs on one number of processes, and the exponents, as a Markdown table."""
+    """Return a Markdown table of runs on equally many processes: seconds of each part, its exponent, and memory."""
     lines = [["seconds of a step", *(f"{row['points']}" for row in rows), "exponent"]]
     for part in ("step", *PARTS, "rest"):
         lines.append([part, *(f"{row[part]:.2g}" for row in rows), f"{found.get(part, np.nan):.2f}"])
@@ -220,7 +220,7 @@ def by_processes(rows: list[dict]) -> str:
 
 
 def prediction(model: dict[str, float], dim: int) -> str:
-    """Return the cost model, and its prediction for many processes."""
+    """Return the cost model as text, and its predictions for many processes."""
     form = f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} H + {model['c']:.2g} log2 P"
     lines = [f"{dim}D: T = {form} s, within {100 * model['worst']:.0f} % of the runs"]
     for share in (1e4, 1e5):
@@ -251,7 +251,7 @@ def draw(out: Path, rows: list[dict]) -> None:
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
-    """Draw the times of the most expensive parts, and lines proportional to the number of points."""
+    """Draw the time of the longest parts and the memory, with lines proportional to the number of points."""
     n, found = np.array([row["points"] for row in rows]), exponents(rows)
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
 """A soft column settles to less than half its height under its own weight.
 
-A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  It stands between smooth walls.  Gravity,
-increased to 10 m/s² in equal steps, compresses the column to 24.06 m.  The stretch at the foot is 0.3, so points cross
-many cells.  The first Piola-Kirchhoff stress at the reference height Y balances the weight above, P = -rho0 g (l0 - Y).
-In a column of constant width, this stress equals the Cauchy stress.  For Hencky's law the stretch is Lambert's W.
-Source: the column of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), a hundredth as stiff.  On
-one process.
+A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  The column stands between smooth walls.
+Gravity, increased to 10 m/s² in equal steps, compresses the column to 24.06 m, and its foot to 0.3 of the initial
+length, so points cross many cells.  The first Piola-Kirchhoff stress at the reference height Y carries the weight
+above, P = -rho0 g (l0 - Y).  In a column of constant width this stress equals Cauchy's stress.  With Hencky's law, the
+stretch follows from Lambert's W function.  Source: the column of AMPLE (Coombs & Augarde 2020,
+doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its stiffness.  On one process.
 
-Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted with their volumes; `height`
-is the relative error of the height.  With 16 and 64 cells over the initial height, stress errors published for GIMP are
-3.7e-3 and 4.4e-4; here they are 3.4e-4 and 6.4e-6.  `--quadrature point` integrates at the points instead of over their
-domains.  The stress error is then some 8 % with any number of cells.
+Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted by volume; `height` is the
+relative error of the column's height.  With 16 and 64 cells over the initial height, the published stress errors of
+GIMP are 3.7e-3 and 4.4e-4; here they are 3.4e-4 and 6.4e-6.  `--quadrature point` integrates at the points instead of
+over the pieces of their domains; its error is about 8 % with any number of cells.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FOAM = mpm.Hencky(bulk=EXACT.bulk, shear=EXACT.shear, porosity=POROSITY, grain_d
 
 @dataclass
 class Outcome:
-    """The settled column: initial heights Y, present heights y (n,), m, stress (n,), Pa, and volume0 of the points."""
+    """The column at rest: heights (n,), m, initially (Y) and now (y), stress (n,), Pa, and initial volumes (n,)."""
 
     Y: np.ndarray
     y: np.ndarray
@@ -43,7 +43,7 @@ class Outcome:
 
 
 def run(cells: int = 64, steps: int = 40, quadrature: str = "domain") -> Outcome:
-    """Load the column, `cells` cells high, in equal steps."""
+    """Load the column, `cells` cells high, in `steps` equal steps."""
     h = EXACT.l0 / cells
     grid = mpm.Grid([0, 0], [h, EXACT.l0], [1, cells])
     column = mpm.box(grid, [0, 0], [h, EXACT.l0], per_cell=2)
@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome, rival: Outcome) -> None:
-    """Draw the stress over the present height, with the exact curve and the result of standard MPM."""
+    """Draw the stress against the present height, with the exact curve and the stress by standard MPM."""
     fig, ((ax,),) = common.figure(1, 1, (6.5, 5))
     Y = np.linspace(0, EXACT.l0, 201)
     ax.plot(EXACT.stress(Y) / 1e3, EXACT.position(Y), color="black", lw=1, label="exact")

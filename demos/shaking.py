@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A shear wave rises from the ground into a soft layer: amplification at the surface, against the exact amplification.
+"""A shear wave from the ground enters a soft layer: amplification at the surface against the exact solution.
 
-A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  An absorbing base 5 m below truncates the ground.  A
-shear pulse enters through the base, and reflected waves leave through the base.  The sides have no vertical
-displacement, as in an infinite layer.  The reference motion is that of the free surface of the ground without layer:
-twice the incoming wave.  The amplification, the ratio of the spectra of surface and reference motion, is
+A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  The computed ground ends at an absorbing base, 5 m
+below the layer.  A shear pulse enters through this base, and reflections from layer and surface leave through it.  The
+sides have no vertical displacement, as in an infinite layer. The reference motion is that of a free surface of the
+ground without the layer, which is twice the incoming wave.  The spectrum of the surface motion, divided by that of the
+reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
-with c and c_g of the layer and the ground.  The work of the wave and the work on the base enter the energy balance.
+with wave velocity c and density rho of the layer, and c_g and rho_g of the ground.  The energy balance includes the
+work of the incoming wave and of the absorbing base.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ def incoming(t: np.ndarray) -> np.ndarray:
 
 
 def shaken(cells: int, steps: int) -> tuple[mpm.Result, np.ndarray]:
-    """Return a run with a number of steps, and of cells over the layer, and the velocity of the surface, m/s."""
+    """Return the result of a run with `cells` cells over the layer, and the velocity of the surface, m/s."""
     h = LAYER / cells
     rows = round(GROUND / h)
     grid = mpm.Grid([0, -GROUND - h], [4 * h, LAYER + h], [4, cells + rows + 2])
@@ -61,7 +63,7 @@ def shaken(cells: int, steps: int) -> tuple[mpm.Result, np.ndarray]:
 
 
 def exact(f: np.ndarray) -> np.ndarray:
-    """Return the exact amplification at frequencies, Hz."""
+    """Return the exact amplification at the frequencies f, Hz."""
     phase = 2 * np.pi * f * LAYER / SPEEDS[1]
     a = DENSITIES[1] * SPEEDS[1] / (DENSITIES[0] * SPEEDS[0])
     return 1 / np.abs(np.cos(phase) + 1j * a * np.sin(phase))

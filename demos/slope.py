@@ -4,11 +4,11 @@
 A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, without
 dilation.
 
-1. Factor of safety.  `mpm.factor_of_safety` divides c and tan(phi) of the slope at rest by trial factors, and checks
-   whether the viscous stress decays.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
-   Lane 1999).
-2. Run-out.  The strength is suddenly divided by 1.6, in soil with the viscosity eta.  The slope slides until its shape
-   is stable; the factor of safety of this shape differs from one by less than 0.1.
+1. Factor of safety: the largest divisor of c and tan(phi) for which the slope is stable.  `mpm.factor_of_safety`
+   reduces the strength of the slope at rest, and checks whether the viscous stress, in excess of the strength, decays.
+   The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
+2. Run-out: the strength is suddenly divided by 1.6, in soil with the viscosity eta.  The slope slides until its new
+   shape is just stable.  The factor of safety of this shape differs from one by less than 0.1.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VISCOSITY = 0.1 * WEIGHT * HEIGHT  # Pa s
 
 
 def shape(cells: int) -> tuple[mpm.Grid, list[mpm.Body]]:
-    """Return the grid, with a number of cells over the slope's height, and ground and bank."""
+    """Return the grid, with `cells` cells over the slope's height, and the bodies ground and bank."""
     h, middle = HEIGHT / cells, CREST + RUN / 2
     columns, rows = round((CREST + RUN + BEFORE) / h), round(DEPTH / h)
     length = columns * h
@@ -44,7 +44,7 @@ def shape(cells: int) -> tuple[mpm.Grid, list[mpm.Body]]:
 
 
 def slope(cells: int) -> mpm.Simulation:
-    """Return the slope at rest, with a number of cells over its height; t is zero."""
+    """Return the slope at rest at t = 0, with `cells` cells over its height."""
     grid, bodies = shape(cells)
     soil = mpm.MohrCoulomb(
         bulk=YOUNG / (3 - 6 * POISSON),
@@ -62,7 +62,7 @@ def slope(cells: int) -> mpm.Simulation:
 
 
 def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
-    """Divide the strength and let the slope run out; half of the steps are half a second long, the others longer."""
+    """Divide the strength and let the slope run out, in `steps` steps of half a second and four long steps."""
     friction = np.degrees(np.arctan(np.tan(np.radians(FRICTION)) / WEAKER))
     s.stage(fields={"friction": friction, "cohesion": COHESION / WEAKER})
     s.run(0.5 * steps, 0.5, progress=False)

@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: MIT
 """A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
 
-A bank of saturated soil, 10 m high, stands under water on a rough floor, with vertical sides.  Half of the bank, 10 m
-long, is computed; x = 0 is a plane of symmetry.  Pressures are excess pressures relative to the water outside.  The
-weight is buoyant, gamma' = (1 - n) (rho_s - rho_w) g, a term in UFL.  Inertia is neglected.  On one process.
+A bank of saturated soil with a vertical side stands on a rough floor under water.  Half of it is computed, 10 m high
+and 10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight
+is buoyant, gamma' = (1 - n) (rho_s - rho_w) g, and is a term in UFL.  Inertia is neglected.  On one process.
 
 1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
-   height H stands while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato 2000;
-   the best circle: 3.83, Fellenius 1927).  Failure is a settlement of the crest 20 times as large as in the first
-   steps; with 10 or 40 times the result changes by 1 %.  With 10 and 20 cells over the height the bank fails at 3.93
-   and 3.85, which is 3.9 and 1.9 % too large.  The error is of first order in the cell size, and the extrapolated value
-   is 3.78.
-2. Run-out.  With friction the consolidated bank loses its cohesion within T = 10 minutes, much faster than the soil
-   drains.  The bank slumps, and the crest moves on top of the flowing soil.  In front of the toe, water carries more
-   than half of the weight.  The final length of the bank is twice the initial length; then the excess pressure drains.
-    The final slope is 23.5 degrees, and 29.3 degrees in the steepest section of length H / 3.  The friction angle is 25
-   degrees; a Drucker-Prager cone without dilation mobilises only arcsin(eta) = 24.2 degrees.  The remaining hundredth
-   of the cohesion adds a little.  Twice the number of cells or steps, or half the viscosity, change run-out and height
-   by less than 2 %.
+   height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
+   2000; critical slip circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
+   step as in the first steps; with 10 or 40 times, the result changes by 1 %.  With 10 and 20 cells over the height the
+   bank fails at gamma' H / c = 3.93 and 3.85, which is 3.9 and 1.9 % too large.  This error is of first order in the
+   cell size, and the extrapolated value is 3.78.
+2. Run-out.  The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
+   The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
+   more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The
+   final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The friction
+   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only arcsin(eta) = 24.2.  The remaining
+   cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number of cells or steps, or half the
+   viscosity, changes run-out and height by less than 2 %.
 
-The cohesion is a function of position, so the points carry a cohesion (`points.data["cohesion"]`).  The function
-`observe` reduces this cohesion between two steps.  A step that does not converge is repeated with a shorter length and
-the same strength.  The shorter step converges because a viscous stress 2 eta D, a term in UFL, limits the velocity. eta
-/ T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation: the side of the
-bank ends on the floor, at plastic strains of several hundred per cent.
+The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
+reduces it after each step.  A step that does not converge is cut, and repeated with the same strength.  The shorter
+step converges because a viscous stress 2 eta D, which is also a term in UFL, limits the velocity of the bank. eta / T
+is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation, because the vertical
+side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank, with cells over its height and `room` m in front, and a probe on the crest."""
+    """Return the consolidated bank with a probe on its crest; cells: over its height; room: floor in front of it, m."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -77,9 +77,9 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma H / c (n,), and settlements per step, divided by that in the first five steps (n,).
+    """Stability numbers gamma H / c (n,), and settlements of the crest in each step / those in the first five (n,).
 
-    critical: the number at which the bank fails.
+    critical: the stability number at which the bank fails.
     """
 
     cells: int
@@ -89,7 +89,7 @@ class Failure:
 
 
 def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
-    """Reduce the strength of an undrained bank without friction until the crest settles without bound."""
+    """Reduce the strength of an undrained bank without friction until the bank fails."""
     s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[common.weight(WEIGHT)])
     number, settlement, rate = [start], [0.0], np.zeros(0)
     while len(rate) < 10 or rate[-1] < 2 * RUNAWAY:
@@ -109,10 +109,10 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 
 @dataclass
 class Frame:
-    """The bank at a time, s.
+    """State of the bank at one time, s.
 
-    corners of the domains, m; surface (m, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic strain;
-    volume, m²; cohesion, Pa.
+    corners of the domains, m; surface: positions (m, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic
+    strain; volume, m²; cohesion, Pa.
     """
 
     t: float
@@ -134,7 +134,7 @@ class Frame:
         return float(np.degrees(np.arctan2(self.surface[:, 1].max(), self.run_out)))
 
     def steepest(self, length: float) -> float:
-        """Return the steepest slope of the surface over a horizontal length, m, degrees."""
+        """Return the steepest inclination, degrees, of a part of the surface with this horizontal length, m."""
         x, y = self.surface[: np.argmax(self.surface[:, 0]) + 1].T
         at = np.linspace(0, self.run_out - length, 200)
         fall = np.interp(at, x, y) - np.interp(at + length, x, y)
@@ -145,7 +145,7 @@ class Frame:
 class Slump:
     """Results of a run; `rest` and `drained` are the indices of the frames at which the two stages end.
 
-    alternating: largest rms, Pa, of pressures in front of the bank that alternate from cell to cell.
+    alternating: largest rms, Pa, of the part of the pressures in front of the bank that alternates from cell to cell.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -159,7 +159,7 @@ class Slump:
 
 
 def alternating(p: np.ndarray) -> np.ndarray:
-    """Return the alternating part, along both axes, (n - 2, m - 2) of the cells' values (n, m)."""
+    """Return the part (n - 2, m - 2) of cell values (n, m) that alternates from cell to cell along both axes."""
     for axis in (0, 1):
         q = np.moveaxis(p, axis, 0)
         p = np.moveaxis((2 * q[1:-1] - q[:-2] - q[2:]) / 4, 0, axis)
@@ -167,7 +167,7 @@ def alternating(p: np.ndarray) -> np.ndarray:
 
 
 def at_toe(s: mpm.Simulation) -> float:
-    """Return the rms, Pa, of alternating pressures in cells in front of the initial side of the bank."""
+    """Return the rms, Pa, of the alternating part of the pressures in cells beyond the initial side of the bank."""
     cells, p = s.cells(), np.full(tuple(s.grid.shape), np.nan)
     p[tuple(s.grid.index(cells.x).T)] = cells.pressure
     found = alternating(p)[round(HEIGHT / s.grid.h[0]) - 1 :]
@@ -198,7 +198,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the strength that the soil has at the end of the next step."""
+        """Reduce the cohesion to its value at the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 
@@ -222,7 +222,7 @@ def slump(cells: int, steps: int) -> Slump:
 
 
 def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
-    """Return relative errors of the results; slopes in degrees."""
+    """Return relative errors of the results, and slopes in degrees."""
     coarse, fine = (f.critical for f in failures)
     start, rest, end = run.frames[0], run.frames[run.rest], run.frames[run.drained]
     return {
@@ -281,14 +281,14 @@ def report(run: Slump, found: dict[str, float]) -> None:
 
 
 def stages(run: Slump) -> dict[str, int]:
-    """Return names and frames of the stages in the picture."""
+    """Return names of the stages that are drawn, each with the index of its frame."""
     lost = np.array([f.cohesion for f in run.frames])
     weak = int(np.argmax(lost <= 1.001 * WEAK))
     return {"failing": int(0.6 * weak), "slumping": int(0.9 * weak), "at rest": run.rest, "drained": run.drained}
 
 
 class Panel:
-    """A frame drawn on axes: values of the domains, and the surface."""
+    """Drawing of a frame: domains coloured by values, and the surface."""
 
     def __init__(self, ax, frame: Frame, values: np.ndarray, **style):
         from matplotlib.collections import PolyCollection
@@ -307,7 +307,7 @@ class Panel:
 
 
 def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values to draw: pressure, kPa, and plastic strain."""
+    """Return the values of the points that are drawn: pressures, kPa, and plastic strains."""
     return frame.pressure / 1e3, np.maximum(frame.strain, 1e-3)
 
 
@@ -360,7 +360,7 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
 
 
 def animate(path: Path, run: Slump) -> None:
-    """Draw the slump as an animation; each part runs faster than the part before."""
+    """Draw the slump as an animation, in which time is faster in each later part."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     weak = int(np.argmax([f.cohesion <= 1.001 * WEAK for f in run.frames]))

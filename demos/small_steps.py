@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Error as the time step tends to zero: only the spatial error remains, also in a moving body.
+"""As the time step tends to zero, the error tends to the spatial error, for columns at rest and in motion.
 
-Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, so
-T_v increases by 0.1 to 1e-5 in a step.  The error is the rms of p - exact at the centroids of the cells, divided by p0.
-The error of time integration decreases with the step.  The remaining error must be the spatial error, known from
-semi-discrete equations that are solved exactly in time.  This error must not grow with the number of steps.  A pressure
-that is averaged from cells to points and back in every step would diffuse.  There are three columns:
+Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1
+to 1e-5 of the time of consolidation.  The error is the root mean square of (p - exact) / p0 at the centroids of all
+cells.  The error of time integration decreases with the step.  The remaining error must be the spatial error, which is
+known from the exact solution in time of the semi-discrete equations.  This spatial error must not depend on the number
+of steps; if pressures were averaged to points and back in every step, they would diffuse.  Three columns:
 
-* resting: the column does not move through the grid;
-* moving: during consolidation the base moves down by half the height, through half of all cells;
-* moving, soft water: the storage coefficient of the water equals that of the skeleton, S = 1/M.  The pressure of stiff
-  water follows from the strain of the points.  The pressure of soft water is also remapped at each grid reset.
+* column at rest on the grid;
+* moving column: during consolidation the base moves down by half the height, through half of all cells;
+* moving column with soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of stiff water follows
+  from the strain of the points, but that of soft water is also remapped from grid to grid.
 
 Motion adds an error, because all points of a cell have the same strain increment in a step.  This error is largest at
-the drained top, in nearly empty cells.  The error of the remap itself is second order and smaller.
+the drained top, in cells that contain little of the column.  The error of the remap itself is of second order and
+smaller.
 
-The overshoot, the largest p / p0 - 1 of all steps, is zero in the resting column for any step size.  In one dimension
-the scheme therefore has no smallest time step.  In more dimensions, small steps cause checkerboard modes of the
-pressure, unless pressure jumps are damped (`storage.py`).  The demo shows these modes with and without damping, after
-the first step under a strip load on a layer in a rough box.  On one process.
+The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length.  In one
+dimension, the scheme therefore has no smallest time step.  In more dimensions, small steps cause checkerboard modes of
+the pressure, unless the jumps of the pressure are damped (`storage.py`).  The demo shows these modes in the first step
+after a strip load on a layer in a rough box, with and without damping.  On one process.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # fraction of the layer's ti
 
 @dataclass
 class Run:
-    """A column at T_END: depth z of the cells' centroids divided by the height, p / p0, and the error."""
+    """A column at T_END: depths z of centroids / height, pressures / p0, and errors as in the module's docstring."""
 
     z: NDArray[np.float64]
     p: NDArray[np.float64]
@@ -54,7 +55,7 @@ class Run:
 
 
 def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, strain: float = 1e-5) -> Run:
-    """Consolidate a column to T_END in equal steps while its base moves down by way * HEIGHT."""
+    """Consolidate a column until T_END in equal steps, while its base moves down by way * HEIGHT."""
     h, modulus = HEIGHT / cells, SOIL.oedometric
     load, p0 = strain * modulus, strain * modulus / (1 + softness)
     water = mpm.Fluid(bulk=SOIL.porosity * modulus / softness if softness else np.inf)
@@ -84,7 +85,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
 
 
 def error_of_cells(cells: int) -> float:
-    """Return the error on equal cells for exact time integration of two-point fluxes and damping."""
+    """Return the error with exact time integration, for two-point fluxes and the damping of small steps."""
     laplacian = 2 * np.eye(cells) - np.eye(cells, k=1) - np.eye(cells, k=-1)
     laplacian[0, 0] = laplacian[-1, -1] = 1
     outflow = laplacian.copy()
@@ -96,7 +97,7 @@ def error_of_cells(cells: int) -> float:
 
 
 def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]:
-    """Return p / load (nx, ny) after the first step under a strip load; dt: divided by the time of consolidation."""
+    """Return p / load (nx, ny) after the first step under a strip load; dt: step / time of consolidation."""
     grid = mpm.Grid([0, 0], [2 * HEIGHT, HEIGHT], [2 * cells, cells])
     soil = law(bulk=SOIL.bulk, shear=SOIL.shear, porosity=SOIL.porosity, conductivity=SOIL.conductivity)
     load = 1e-5 * SOIL.oedometric
@@ -150,7 +151,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
-    """Draw the error against the step, and the pressure over the depth of the longest and the shortest steps."""
+    """Draw the error against the step, and the pressure against depth for the longest and the shortest steps."""
     fig, ((left, *profiles),) = common.figure(1, 3, (14, 4.6))
     dt = T_END / np.array(o.steps)
     marks = dict(zip(runs, "ox+", strict=True))
@@ -174,7 +175,7 @@ def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
 
 
 def draw_strip(o: Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> None:
-    """Draw the pressure after the smallest first step, and the roughness against the step."""
+    """Draw the pressure after the smallest first step, and the roughness of the pressure against the step."""
     fig, ((*axes, right),) = common.figure(1, len(strips) + 1, (15, 3.8))
     for ax, (name, fields) in zip(axes, strips.items(), strict=True):
         extent = (0, 2 * HEIGHT, 0, HEIGHT)

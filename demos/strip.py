@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Large consolidation under a strip load: a square layer settles by an eighth of its height, and porosity decreases.
+"""Large consolidation under a strip load: a layer settles by an eighth of its height, and its porosity decreases.
 
-A layer between smooth walls on a smooth, impervious base carries a dead load q on a fifth of its drained surface. Half
-of the layer is computed; x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6.  Its
-conductivity k0 10^(5 (J - 1)) falls as pores close.  Grains and water are incompressible.  T = k0 E t/(gamma_w H²) is
-the reduced time, and the load rises until T = 0.01.  The case is that of Carter, Small and Booker (1977), as in Abaqus'
-benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, and a law without stiffness of
-the grains fails.  The package reports this failure, and the demo shows the results up to this time.
+A layer between smooth walls, on a smooth, impervious base, carries a dead load q on a fifth of its drained surface.
+Half of the layer is computed, as wide as high; x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0)
+with porosity 0.6.  Its conductivity k0 10^(5 (J - 1)) decreases as pores close.  Grains and water are incompressible.
+T = k0 E t/(gamma_w H²) is the reduced time, and the load increases until T = 0.01.  Source: Carter, Small and Booker
+(1977), as in Abaqus' benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, and the
+law, which has no stiffness of the grains, fails.  The package reports this, and the demo shows the results up to this
+time.
 
-Checks for q/E = 0.25 use Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80 cells.  The
-extrapolation moves the result of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  `at_once` is the
-error of the displacement of the middle at T = 0.01, `settlement` the largest error from T = 0.1 on.  `edge` is the
-largest error at the edge of the strip, where the load jumps, and `beside` that at the far corner, from T = 0.1 on.  All
-errors are relative to the displacement of the middle.  --reference runs Taylor-Hood elements on the same cells.  On one
-process.
+The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
+cells. The extrapolated settlements differ from those of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  Errors:
+`settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once` its error at
+T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` that at the far corner.  All
+errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on the same cells. On
+one process.
 """
 
 from __future__ import annotations
@@ -57,22 +58,22 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def conditions(load: float) -> dict:
-    """Return the conditions; load: divided by E."""
+    """Return the conditions; load: q / E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
     return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the ends T of the steps; up to RAMP, two thirds of the number of steps in each later decade."""
+    """Return the times T at which steps end: `a_decade` in each decade after RAMP, and two thirds of them before."""
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
 
 
 @dataclass
 class Outcome:
-    """Histories: T, and upward displacements of PLACES divided by HEIGHT.
+    """Histories: reduced times T, and upward displacements of PLACES divided by HEIGHT.
 
-    frames: T, corners, pressure divided by E and porosity of the points; why: reason of an early end.
+    frames: T, corners, pressures divided by E, and porosities of the points.  why: reason if the run ended early.
     """
 
     T: list[float] = field(default_factory=list)
@@ -85,7 +86,7 @@ class Outcome:
 
 
 def run(cells: int = 40, load: float = 0.25, a_decade: int = 30) -> Outcome:
-    """Consolidate a layer, `cells` cells high; load: divided by E."""
+    """Consolidate a layer, `cells` cells high, under the load q = load * E."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [HEIGHT, HEIGHT + 4 * h], [cells, cells + 4])
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
@@ -107,12 +108,12 @@ def run(cells: int = 40, load: float = 0.25, a_decade: int = 30) -> Outcome:
 
 
 def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]:
-    """Return the present frame."""
+    """Return the present frame, see `Outcome`; T: reduced time."""
     return T, s.points.corners.copy(), s.points.pressure / E, s.point_fields().porosity
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the upward displacements (times, PLACES) of Taylor-Hood elements divided by HEIGHT, at TIMES."""
+    """Return the upward displacements (times, PLACES), divided by HEIGHT, of Taylor-Hood elements at TIMES."""
     fem, out = BiotFEM([0, 0], [HEIGHT] * 2, [cells] * 2, SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)
@@ -159,7 +160,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw initial pressure, final porosity, and displacements of the surface against time."""
+    """Draw the initial pressure, the final porosity, and the displacements of the surface against time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (14, 4.4))
     kinds = (("pore pressure / E (-)", 2, "viridis"), ("porosity (-)", 3, "cividis"))
     for ax, (T, *values), (label, k, colours) in zip(

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Write the numbers in the tables of README.md and demos/README.md from the output of the demos.
+"""Write the numbers in README.md and demos/README.md from the output of the demos.
 
-A comment follows each number.  The comment names the run of a demo, the entries of its JSON output, and a format:
+A comment follows each number.  It contains the command of the demo, the entries of its JSON output, and a format:
 
     | Terzaghi's column, pressure at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
 demos/results contains the output of the demos, with the run time in `seconds` and the release of dolfinx.
-demos/pictures contains the pictures of the first run of each demo on the pages.  A table that a demo writes as a file
-stands between `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
+demos/pictures contains the pictures of the first run of each demo on the pages.  A table that a demo writes to a file
+is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
     bash demos/run.sh tables                        # writes the numbers from demos/results
     bash demos/run.sh tables --run terzaghi mandel  # runs these demos first; `--run all` takes hours
@@ -37,12 +37,12 @@ TABLE = re.compile(
 
 
 def kept(run: str) -> Path:
-    """Return the file with the output of a run."""
+    """Return the path of the file in demos/results with the output of a run."""
     return RESULTS / (re.sub(r"\W+", "_", run) + ".json")
 
 
 def figure(value: float, form: str) -> str:
-    """Return a number as text in the format of its comment: %, +%, min (a time), or a Python format."""
+    """Return a number as text; form: %, +%, min (a time), or a format of Python."""
     if form.endswith("%"):
         return f"{100 * value:{form[:-1]}.2g}"
     if form == "min":
@@ -51,7 +51,7 @@ def figure(value: float, form: str) -> str:
 
 
 def figures(run: str, entries: str, form: str) -> str:
-    """Return the numbers that a comment names, as text."""
+    """Return the numbers, as text, that a comment requests."""
     if not kept(run).exists():
         sys.exit(f"{kept(run)}: missing: bash demos/run.sh tables --run {run.split()[0]}")
     printed, values = json.loads(kept(run).read_text()), []
@@ -64,13 +64,13 @@ def figures(run: str, entries: str, form: str) -> str:
 
 
 def written(page: str) -> str:
-    """Return the text of a page with new numbers and tables."""
+    """Return a page with numbers and tables updated from demos/results."""
     page = FIGURE.sub(lambda m: f"{figures(m['run'], m['entries'], m['form'])} {m['comment']}", page)
     return TABLE.sub(lambda m: m["begin"] + kept(m["run"]).with_suffix(".md").read_text() + m["end"], page)
 
 
 def runs(pages: Iterable[str]) -> dict[str, str]:
-    """Return the runs that comments on the pages name, each with the table that it writes, or nothing."""
+    """Return the runs in the comments of pages, each with the table that it writes, or an empty string."""
     found = {}
     for page in pages:
         found |= {m["run"]: "" for m in FIGURE.finditer(page) if m["run"] not in found}
@@ -79,7 +79,7 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
 
 
 def take(run: str, table: str, pictures: bool) -> None:
-    """Run a demo; store its output, its table and, if requested, its pictures for the pages."""
+    """Run a demo; store its output, its table and, if `pictures` is set, its pictures for the pages."""
     import dolfinx
 
     demo, *options = shlex.split(run)
@@ -103,7 +103,7 @@ def take(run: str, table: str, pictures: bool) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run demos if requested, and write the pages."""
+    """Run the demos given by --run, if any, and update the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="first run these demos, or all")
     o = parser.parse_args(argv)

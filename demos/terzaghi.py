@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Terzaghi's consolidation: a saturated layer is loaded suddenly and drains at its top.
 
-A load p0 acts on a column of 1 m between smooth walls, impervious at its foot, from the first step on.  Initially the
-incompressible pore water carries the whole load, p = p0.  During drainage the load is transferred to the skeleton:
+A column of 1 m between smooth walls, impervious at its foot, takes a load p0 in the first step.  Initially the
+incompressible pore water carries the whole load, p = p0.  As water drains, the load is transferred to the skeleton:
 dp/dt = c_v d²p/dz², c_v = kappa (K + 4G/3).  The load strains the skeleton by 1e-5, so small-strain theory is accurate.
-T_v = c_v t / height² is the reduced time.  Source: Terzaghi (1923); the series in Verruijt, Theory and Problems of
-Poroelasticity (2016). On one process.
+T_v = c_v t / height² is the reduced time.  Source: Terzaghi (1923); series in Verruijt, Theory and Problems of
+Poroelasticity (2016).  On one process.
 
-Errors: the largest |p - exact| / p0 of all cells, at centroids, at T_v = 0.1, 0.5 and 1, and the relative error of the
-`settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.
+Errors: the largest |p - exact| / p0 at the centroids of all cells, at T_v = 0.1, 0.5 and 1, and the relative error of
+the `settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """Dimensionless results at each output time: time factor T_v, depths and pressures of the cells, settlement."""
+    """Results at each output time: T_v, depth / height and p / p0 of the cells, and settlement / final settlement."""
 
     result: mpm.Result
     time: list[float] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Outcome:
     settlement: list[float] = field(default_factory=list)
 
     def at(self, time: float) -> int:
-        """Return the index of the output time nearest to T_v."""
+        """Return the index of the output time nearest to the reduced time `time`."""
         return int(np.argmin(np.abs(np.array(self.time) - time)))
 
 
@@ -50,7 +50,7 @@ def run(
 ) -> Outcome:
     """Consolidate a column of `cells` cells to T_v = 1 under a load that strains it by `strain`.
 
-    Steps are equal, or adaptive with the tolerance `rtol`.
+    Steps are equal, or adaptive if `rtol` is given.
     """
     h, load = HEIGHT / cells, strain * SOIL.oedometric
     grid = mpm.Grid([0, 0], [h, HEIGHT], [1, cells])
@@ -111,7 +111,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure over the depth and the settlement against time, with the exact curves."""
+    """Draw the pressure against depth and the settlement against time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, time in enumerate(SAMPLES):

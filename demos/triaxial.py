@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Triaxial tests of soil laws at a point, against closed-form solutions.
+"""Triaxial tests of soil laws at a point, compared with closed-form solutions, to check a law before its use.
 
-Modified Cam Clay at three overconsolidation ratios, drained and undrained, starts from the same isotropic stress.
-In undrained tests the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  During
-yield Q = M sqrt(P (P_c - P)).  The drained stress path is q = 3 (p - p_0), and ends at q = M p.  Mohr-Coulomb sand ends
-at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in Kirchhoff stresses, in compression and in extension.
+Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the same isotropic stress.
+In an undrained test the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs. During
+yield Q = M sqrt(P (P_c - P)).  In a drained test the stress path is q = 3 (p - p_0), and ends at q = M p.  Tests of
+Mohr-Coulomb sand, in compression and in extension, end at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in
+Kirchhoff stresses.
 
 Errors are relative, and refer to the final states.
 
 --cost N compresses a block of N x N cells of Drucker-Prager, Mohr-Coulomb and Cam Clay soil until all of it yields.
-Steps alternate between the laws.  The demo prints the processor time of a step, divided by that of Drucker-Prager soil.
+Steps of the three laws alternate, and the demo prints the processor time of a step relative to Drucker-Prager soil.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ KINDS = ("triaxial drained", "triaxial undrained")
 
 
 def clays(steps: int) -> dict[tuple[str, float], mpm.ElementTest]:
-    """Return the tests of the clay by their kind and overconsolidation ratio."""
+    """Return the tests of the clay; keys: kind of test (drained or undrained) and overconsolidation ratio."""
     ends = {"triaxial drained": 1.5, "triaxial undrained": 0.6}
     return {(k, R): mpm.element_test(replace(CLAY, OCR=R), k, ends[k], steps=steps) for k in KINDS for R in RATIOS}
 
@@ -44,7 +45,7 @@ def end_of(kind: str, R: float) -> float:
 
 
 def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
-    """Return the distance of the sand's final stresses from the Mohr-Coulomb surface, divided by the cell pressure."""
+    """Return the distance of the final stresses of the sand from the Mohr-Coulomb surface, divided by P0."""
     out = {}
     for strain, r in tests.items():
         tau = np.sort(np.diag(r.stress[-1])) * np.linalg.det(r.F[-1])
@@ -54,7 +55,7 @@ def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
 
 
 def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
-    """Return a block with p_0 on its free side, compressed by a thousandth of its height per second."""
+    """Return a block, compressed by a thousandth of its height in 1 s, under the pressure p_0 on its free side."""
     h = 1 / cells
     grid = mpm.Grid([0] * 2, [1 + 2 * h] * 2, [cells + 2] * 2)
     squeeze = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
@@ -66,9 +67,9 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 
 
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
-    """Return the processor time of a step, divided by that of Drucker-Prager soil; steps of the laws alternate.
+    """Return the processor time of a step of each law, divided by that of Drucker and Prager's law.
 
-    Sands have associated flow; otherwise shear bands form in the uniform block.
+    Steps of the laws alternate.  Sands have associated flow, because otherwise shear bands form in the block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}
@@ -110,7 +111,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict[float, mpm.ElementTest]) -> None:
-    """Draw stress paths, stress-strain curves, pore pressures and volumes."""
+    """Draw stress paths, and stresses, pore pressures and volumes against strain."""
     fig, ((path, curve), (water, sand)) = common.figure(2, 2, (11, 7.5))
     for (kind, R), r in tests.items():
         drained, colour = kind == KINDS[0], f"C{RATIOS.index(R)}"

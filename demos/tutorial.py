@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The method, from one particle domain cut by the grid to a consolidating column; read it from top to bottom.
+"""The method, step by step, from one particle domain that the grid cuts to a consolidating column.
 
-You need to know FEniCSx, but nothing of this package.  Each part prints its result and ends in an assertion.  On one
+Readers need to know FEniCSx, but not this package.  Each part prints its result and ends with an assertion.  On one
 process.
 """
 

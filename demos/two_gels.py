@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Contact of two gels: they are pressed together, slide with friction, and separate.
+"""Two gels are pressed together, slide along each other with friction, and separate.
 
-Two half-discs are groups of bodies, each with its own displacements.  The lower gel is fixed, the upper gel follows a
-path.  No force acts between separated gels, however narrow the gap.  As the upper gel passes over the top of the lower
-gel, the contact surface becomes inclined.  The ratio of the force along the path to the vertical force is then below
-the friction coefficient.
+Two half-discs are groups of bodies, each with its own displacements.  The lower gel is fixed, and the upper gel follows
+a prescribed path.  While the gels are apart no force acts between them, however narrow the gap.  As the upper gel
+passes over the top of the lower one, the contact surface inclines.  The ratio of horizontal to vertical force is then
+less than the friction coefficient.
 
 A second scene is the contact of a curved and a flat elastic body.  Largest pressure and half-width are compared with
-Hertz, for the computed contact force.  The errors of both are due to the small number of cells over the half-width.
+Hertz's solution for the computed force.  Both errors are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHOWN = (0.0, 1.0, 2.0, 3.0)
 
 
 def half_disc(grid: mpm.Grid, centre: tuple[float, float], up: float):
-    """Return a half-disc about `centre`.  Its round side faces up (up = 1) or down (-1)."""
+    """Return a half-disc; centre: centre of its flat side, m; up: 1 if its round side faces up, -1 if down."""
     flat = mpm.box(grid, [centre[0] - RADIUS, min(centre[1], centre[1] + up)], np.add(centre, [RADIUS, max(up, 0)]))
     return mpm.mapped(grid, flat, lambda x: centre + _round((x - centre) / RADIUS) * RADIUS)
 
@@ -44,7 +44,7 @@ def path(t: float) -> tuple[float, float]:
 
 
 def scene(cells: int) -> mpm.Simulation:
-    """Return the two gels, with a number of cells over a radius."""
+    """Return the two gels, with `cells` cells over a radius."""
     grid = mpm.Grid([0, 0], [4.5, 2.25], [round(4.5 * cells), round(2.25 * cells)])
     low, high = (1.5, 0.0), (1.5, 2 * RADIUS + GAP)
     bodies = [half_disc(grid, low, 1.0), half_disc(grid, high, -1.0)]
@@ -59,7 +59,7 @@ def scene(cells: int) -> mpm.Simulation:
 
 
 def hertz(cells: int) -> dict[str, float]:
-    """Return the number of cells over the half-width, and relative errors of largest pressure and half-width."""
+    """Return the number of cells over the half-width, and the relative errors of largest pressure and half-width."""
     E, nu, R, L = 1e6, 0.3, 20.0, 4.0
     stiff, top, n = E / (1 - nu**2) / 2, L + 0.3 / cells, [round(L * cells), round((2 * L + 2) * cells)]
     grid = mpm.Grid([0, 0], [L, 2 * L + 2], n)

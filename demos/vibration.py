@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Vibration of a beam and a bar: frequencies, and loss of energy, against exact values.
+"""Vibration of a beam and of a bar: frequencies and energy loss against exact values.
 
 1. A clamped beam, 1 x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
-   theory is accurate.  The first bending frequency is 3.24419 Hz, from spectral elements graded towards the corners
-   of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767 Hz.  Frequencies are fitted to the motion of
-   the tip in three periods.
-2. A free bar, P = E (F - 1), vibrates with strains of 5 % and moves through fifty cells in 25 periods.  In the exact
+   theory is accurate.  The reference of the first bending frequency is 3.24419 Hz, by spectral elements graded to the
+   clamp's corners. The first axial frequency is exactly c / (4 L) = 17.67767 Hz.  The computed frequencies are fitted
+   to the motion of the tip over three periods.
+2. A free bar, P = E (F - 1), vibrates with strains of 5 % and moves over fifty cells in 25 periods.  In the exact
    solution the ends oscillate about the uniform motion by A / (pi c) sin(pi c t / L), without loss of energy.  In each
-   step, SDIRK2 itself loses the fraction gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy, y = omega dt.  The remaining
-   loss is due to resets of the grid.
+   step SDIRK2 itself loses the fraction gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy, with y = omega dt.  The
+   remaining loss is due to grid resets.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ LOST = 0.02  # allowed energy loss of the bar in 25 periods of 40 steps
 
 
 class Bar(mpm.LinearElastic):
-    """P = E (F - 1) along each axis: waves of any amplitude keep their shape."""
+    """Law with P = E (F - 1) along each axis, so waves of any amplitude keep their shape."""
 
     @staticmethod
     def energy(F, bulk, shear):
-        """Return the energy, Pa, as UFL."""
+        """Return the energy, Pa, in UFL."""
         return shear * ((F[0, 0] - 1) ** 2 + (F[1, 1] - 1) ** 2 + F[0, 1] ** 2 + F[1, 0] ** 2)
 
 
@@ -60,7 +60,7 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar; return times in periods, the oscillation of its end, m, and its energy ratio to the start."""
+    """Move the free bar; return times in periods, the oscillation of its end, m, and energy / initial energy."""
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
     low, speed = 2.3 * h, 2.5 / (2 * periods)  # over 2.5 lengths
@@ -81,7 +81,7 @@ def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def own_loss(t: np.ndarray, steps: int) -> np.ndarray:
-    """Return the fraction of the energy that SDIRK2 retains after t periods, with a number of steps in each."""
+    """Return the fraction of the energy that remains with SDIRK2 after t periods, with `steps` steps in a period."""
     y = (GAMMA * 2 * np.pi / steps) ** 2
     return (1 - (y / (1 + y)) ** 2) ** (t * steps)
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Water tables in unsaturated soil: a rise under rain (Vauclin), and a levee during a flood.
+"""Water tables in unsaturated soil: in a slab under rain (Vauclin), and in a levee during a flood.
 
-A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of the slab is computed. Rain
-falls on the middle metre for eight hours.  Above the water table, water spreads through unsaturated soil.  The
-reference is a converged solution of finite volumes, with cells of 1.25 cm.  Source: Vauclin, Khanji and Vachaud (1979),
-with their laws.  The side above the water level of the ditch is a seepage face, but no water seeps out.
+A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of it is computed.  Rain falls
+on its middle metre for eight hours.  Above the water table, water spreads through unsaturated soil.  The reference is a
+converged solution of finite volumes, with cells of 1.25 cm.  Scene and soil laws are those of Vauclin, Khanji and
+Vachaud (1979).  The side above the level of the ditch is a seepage face, through which no water flows here.
 
-The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  The flood level rises by 2.5 m in two
-days, is constant for two days and falls in two days.  The soil of the levee retains water under suction, so water that
-infiltrates late also drains late.
+The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  The water level rises by 2.5 m in two
+days, is constant for two days, and falls again in two days.  The soil of the levee retains water under suction, so
+water that infiltrates late also drains late.
 
-Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours.  A further
-error is that of the final outflow into the ditch.  `balance`: error of the water balance of the slab, divided by the
-rain.  On one process.
+Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours, and the
+relative error of the final outflow into the ditch.  `balance` is the error of the slab's water balance, divided by the
+volume of rain.  On one process.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class Sand:
     """River sand of Vauclin, Khanji and Vachaud."""
 
     def saturation(self, p):
-        """Return S as UFL."""
+        """Return the saturation S (UFL) at the pore pressure p, Pa."""
         return 4e4 / (4e4 + ufl.max_value(-100 * p / WEIGHT, 1e-12) ** 2.90)
 
     def relative_permeability(self, p):
-        """Return k_r as UFL."""
+        """Return the relative permeability k_r (UFL) at the pore pressure p, Pa."""
         return 2.99e6 / (2.99e6 + ufl.max_value(-100 * p / WEIGHT, 1e-12) ** 5.0)
 
 
@@ -76,7 +76,7 @@ def slab(h: float) -> mpm.Simulation:
 
 
 def tables(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and heights, m, of the water table in the columns of cells."""
+    """Return positions and heights, m, of the water table, one for each column of cells."""
     cell = s.cells()
     columns = np.unique(np.round(cell.x[:, 0], 6))
     heights = []
@@ -88,7 +88,7 @@ def tables(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def level(t: float) -> float:
-    """Return the level of the flood, m, at a time, s."""
+    """Return the water level of the flood, m, at the time t, s."""
     return float(np.interp(t / DAY, [0, 2, 4, 6], [0, FLOOD, FLOOD, 0]))
 
 
@@ -147,7 +147,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, frames: list) -> None:
-    """Draw computed and converged water tables of the slab, and pressures in the levee."""
+    """Draw the water tables of the slab, with the converged solution, and pressures in the levee."""
     fig, axes = common.figure(1 + len(frames), 1, (8, 10))
     first, *others = np.ravel(axes)
     for i, (hours, x, z) in enumerate(curves):

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load q acts on a dry column, 10 m high, on a rigid base, which reflects the wave, or on an absorbing base.
-   The stress on the base is zero until L / c.  Then a rigid base carries 2 q until 3 L / c, and an absorbing base q.
-   Behind the front particles have the velocity q / (rho c).  Stresses oscillate behind a front, so their means are
+1. A sudden load acts on a dry column, 10 m high, whose base is rigid and reflects the wave, or absorbs it.  The stress
+   on the base is zero until L / c.  Then it is 2 q on a rigid base, until 3 L / c, and q on an absorbing base.  Behind
+   the front the velocity of the soil is q / (rho c).  Stresses oscillate behind a front, so their means are compared.
+2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), is slow or
+   fast.  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
+   case, water drains only from a layer of 0.3 m below the top, little more than a cell, so the settlement is not
    compared.
-2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), slow or
-   fast.  Settlement of the top and pore pressures are complex amplitudes of the steady oscillation.  In the slow case,
-   only the top 0.3 m drains, little more than a cell.  The settlement is therefore not compared.
-3. A sudden load acts on the same column, with incompressible water and grains, and k = 0.01 m/s.  Results are compared
-   until a wave returns from the base (after de Boer, Ehlers and Liu 1993).  The settlement is q / (M a^(1/2)) int
-   exp(-b s / 2 a) I0(b s / 2 a) ds, with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
+3. The same column, with incompressible water and grains and k = 0.01 m/s, takes a sudden load (after de Boer, Ehlers
+   and Liu 1993).  Until a wave returns from the base, its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2
+   a) ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
 
 The equations are the u-p form: water accelerates with the grains.
 """
@@ -48,10 +48,9 @@ def column(cells: int, conditions: list, soil: mpm.Skeleton, length: float = LEN
 
 
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
-    """Return t divided by L / c, and stress on the base and velocity of the top, divided by their exact values.
+    """Return times / (L / c), and stress on the base and velocity of the top, relative to the exact values.
 
-    The load is sudden.  On a rigid base the stress is computed from the reaction, on an absorbing base from the
-    velocity.
+    The stress on a rigid base is computed from the reaction, that on an absorbing base from the velocity.
     """
     soil, h = SOIL(grain_density=GRAINS), LENGTH / cells
     c = np.sqrt(MODULUS / ((1 - POROSITY) * GRAINS))
@@ -65,7 +64,7 @@ def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
 
 
 def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.ndarray]:
-    """Return the exact amplitudes of the settlement, m, and of pressures, Pa, at depths z, for a load of 1 Pa."""
+    """Return the exact amplitudes of the settlement, m, and of pressures, Pa, at depths z, m, for a load of 1 Pa."""
     k = conductivity / (WATER * GRAVITY)
     # u, p ~ exp(i w t + l z), x = l²
     A = np.array([-k * MODULUS, 0, 0], dtype=complex)
@@ -84,7 +83,7 @@ def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.
 def swinging(
     cells: int, steps: int, periods: int, w: float, conductivity: float
 ) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return amplitudes of the settlement, m, and of pressures, Pa, at depths, m, for a load of 1 Pa."""
+    """Return computed amplitudes of settlement, m, and pressures, Pa, and their depths, m, for a load of 1 Pa."""
     soil = SOIL(grain_density=GRAINS, conductivity=conductivity)
     load = mpm.Traction("top", lambda t: (0, -np.cos(w * t)))
     foot = mpm.Displacement("bottom", (0, 0), "y")
@@ -109,7 +108,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int) -> dict[str, np.ndarray]:
-    """Return times, s, settlements of the top, m, and exact settlements of a saturated column under a sudden load."""
+    """Return times, s, and settlements, computed and exact, m, of the top of a saturated column under a sudden load."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,
@@ -168,7 +167,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, dry: dict, swings: dict, loaded: dict[str, np.ndarray]) -> None:
-    """Draw stresses at the base, pressure amplitudes over the depth, and settlements, with exact values."""
+    """Draw stresses on the base, pressure amplitudes against depth, and settlements, with exact solutions."""
     fig, ((base, depth, top),) = common.figure(1, 3, (14, 4.4))
     steps = {"rigid": [0, 0, 2, 2, 0, 0], "quiet": [0, 0, 1, 1, 1, 1]}
     for k, (name, run) in enumerate(dry.items()):

@@ -98,7 +98,7 @@ SCENES = {
     "dry": (wetted, 25, 50),
     "flow": (flowing, 8, 16),
 }
-"""Scenes with their cells: the ones in which a number is varied, and finer ones."""
+"""Function of each scene, its cells (number or size) while a number is varied, and finer cells for comparison."""
 
 
 def holders(where: str, name: str) -> list:

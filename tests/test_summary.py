@@ -105,7 +105,7 @@ BENCHMARK = {
     "rough tool that touches nothing": {"tools"},
     "contact of groups that are apart": {"contacts"},
     "damping of pressure jumps": {"damping of pressure jumps"},
-    "damping of yielded soil": set(),
+    "damping as in yielded instead of elastic soil": set(),
     "seepage face": set(),
     "initial stress": {"initial stress"},
     "axisymmetry": {"axisymmetry"},

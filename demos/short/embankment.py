@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An embankment is built on soft clay, and the clay consolidates: settlement below the middle of the embankment."""
+"""Settlement under the middle of an embankment that is built on soft clay, which then consolidates."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Excavation below the water table: three lifts are dug, and water that seeps into the pit is pumped out."""
+"""Pumping rate of a pit below the water table: three lifts are excavated, and the pit is kept dry."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files for ParaView (VTK, XDMF), a table for pandas, and a picture."""
+"""Results as files for ParaView (VTK, XDMF), as a table for pandas, and as a picture."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Indentation of a saturated gel by a rigid sphere: the force relaxes as the gel drains, and yields Poisson's ratio."""
+"""A rigid sphere indents a saturated gel; initial and drained force give Poisson's ratio of the gel."""
 
 import mpm_dolfinx as mpm
 

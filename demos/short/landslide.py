@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A landslide: a slope at rest loses its strength, slides with inertia, and comes to rest."""
+"""A slope at rest loses its strength, slides with inertia, and comes to rest."""
 
 import numpy as np
 

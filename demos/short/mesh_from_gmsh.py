@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body from a mesh of gmsh: a quarter of a thick pipe under an inner pressure."""
+"""A body from a mesh of gmsh: a quarter of a thick-walled pipe under an inner pressure."""
 
 import gmsh
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Your own law in UFL: a tissue that stiffens exponentially is compressed by a tenth."""
+"""Your own constitutive law in UFL: a tissue that stiffens exponentially is compressed by a tenth."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Your own term in UFL: a raft on springs (Winkler foundation) under 30 kPa."""
+"""Your own term in UFL, the springs of a Winkler foundation, supports a raft under 30 kPa."""
 
 import ufl
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The same script on one process or on several: `mpirun -n 2 python processes.py`."""
+"""The same script runs on one process or on several: `mpirun -n 2 python processes.py`."""
 
 import mpm_dolfinx as mpm
 

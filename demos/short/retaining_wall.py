@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A smooth retaining wall of 3 m tilts about its toe, away from the sand: the thrust falls to the active thrust."""
+"""Active thrust of sand on a smooth retaining wall of 3 m, which tilts about its toe, away from the sand."""
 
 import mpm_dolfinx as mpm
 

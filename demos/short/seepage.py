@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Seepage through an earth dam with a free surface, between water levels of 8 m and 2 m."""
+"""Seepage with a free surface through an earth dam, with water levels of 8 m and 2 m."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rain on a slope: water infiltrates, suction decreases, and the factor of safety decreases."""
+"""Rain infiltrates a slope, so suction and factor of safety decrease."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A T-bar, a rough cylinder, is pushed down through deep undrained clay: resistance, from half of the bar."""
+"""Resistance of a T-bar, a rough cylinder, in deep undrained clay; by symmetry half of it is computed."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An undrained triaxial test of Modified Cam Clay at one point, without a grid: the strength of the clay."""
+"""Undrained strength of Modified Cam Clay, from a triaxial test at one point, without a grid."""
 
 import mpm_dolfinx as mpm
 

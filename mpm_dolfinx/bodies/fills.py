@@ -47,7 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill lie on the paired faces, and displacements (n, 4, d), m, of these."""
+        """Return which corners (n, 4) of the fill lie on the paired faces, and displacements of these (n, 4, d), m."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]

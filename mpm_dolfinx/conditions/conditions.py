@@ -404,8 +404,8 @@ finer cells by 3.0e-02.
 """
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables, because yielding soil is much softer.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by 1.9e-05,
-and finer cells by 3.0e-02.
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
+1.9e-05, and finer cells by 3.0e-02.
 """
 
 

@@ -167,7 +167,10 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return means over pieces as `mean`; in axisymmetry weighted by plane area, for values at plane centroids."""
+        """Return the means over each point's pieces as `mean` does, but in axisymmetry weighted by area in the plane.
+
+        `values` are values at the centroids of these areas.
+        """
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]

@@ -7,7 +7,8 @@ conducts like a pair of cells that contain only this soil (`fitted`).  Steady fl
 therefore exact at any offset from the grid.
 
 The lines through a cell (see `layers`) that cross a single soil up to the face conduct in parallel.  All lines that
-cross several soils are replaced by one.  Its soils follow in their order, each with its mean fraction of length.
+cross several soils are replaced by one line.  Its soils follow in the order along the lines, each with its mean
+fraction of the length.
 """
 
 from __future__ import annotations

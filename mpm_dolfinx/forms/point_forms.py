@@ -221,7 +221,11 @@ class Places(Keyed):
 
     @cached_property
     def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
-        """For each axis: sets of other axes, as bits, with (mean) products (n,) of offsets, see `Grid.monomials`."""
+        """For each axis, pairs (bits, product).  `bits` selects some of the other axes, see `Grid.monomials`.
+
+        `product` (n,) is the product of the offsets from the cell's midpoint along these axes, or its mean over the
+        piece; 1 for no axis.
+        """
         along = []
         for axis in range(self.grid.dim):
             others = [a for a in range(self.grid.dim) if a != axis]

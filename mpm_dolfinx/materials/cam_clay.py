@@ -48,7 +48,7 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A bulk modulus that the class derives from other constants: it replaces none given by the user."""
+    """A bulk modulus that the class has derived from other constants, not one that the user gave."""
 
     follows = True
 

@@ -249,7 +249,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return two numbers (n, 2) for each point: conductivity, m/s, and index of the conductivity law.
+        """Return two numbers (n, 2) for each point: its conductivity, m/s, and the index of its conductivity law.
 
         Points with equal numbers conduct alike; with a law that depends on position all differ.  The fraction of the
         index denotes the retention curve.

@@ -311,7 +311,7 @@ def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return real numbers of a shape, or raise ValueError."""
+    """Return a value as an array of real numbers; raise ValueError if its shape or type is another."""
     try:
         value = np.asarray(value)
     except ValueError as error:  # rows of different lengths

@@ -105,8 +105,8 @@ class Skeleton:
     The new state must give the stress at the end of the step again if it is evaluated with dt = 0.  They may have the
     argument `cell_size`, the mean edge of a cell, m, which makes softening independent of the grid.
 
-    A law that depends on suction has `suction`: 0.0 in its state, and may have `suction_at_start`: 0.0.  The scene sets
-    these to max(-p, 0), Pa, at the end of a substep and at seeding.  For local unknowns suction is a `trial` value.
+    A law that depends on suction has the state `suction`: 0.0, and may have the state `suction_at_start`: 0.0.  The
+    scene sets them to max(-p, 0), Pa, at the end of a substep and at seeding.  For local unknowns, use it in `trial`.
 
     For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 

@@ -5,9 +5,9 @@ A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. Th
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`). Only velocities
-are carried from step to step. In each step SDIRK2 dissipates GAMMA^4 (omega dt)^4, 0.74 % of (omega dt)^4, of an
-oscillation's energy. This dissipation damps modes that the step cannot resolve.
+The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`).  Only velocities
+are carried from step to step.  In each step SDIRK2 dissipates a fraction GAMMA^4 (omega dt)^4, or 0.0074 (omega dt)^4,
+of an oscillation's energy.  This dissipation damps modes that the step cannot resolve.
 
 The mass is integrated over the pieces of the particle domains, with second moments S about their centroids x_k,
 

@@ -185,7 +185,7 @@ class MomentumForms:
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the sum of nodal forces that `adders` add, over all processes, a local array; room: its buffer."""
+        """Return the nodal forces that the functions `adders` add, over all processes, as local array; room: buffer."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:

@@ -145,7 +145,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws use the gradient: shifted in flowing, dilatant soil, see `SHARE`."""
+        """Return the positions at which laws use the gradient; they are shifted in flowing, dilatant soil (`SHARE`)."""
         if not self._scene.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self._scene.dilating(cut.points))

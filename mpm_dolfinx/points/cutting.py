@@ -83,7 +83,8 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 def simplices(dim: int) -> NDArray[np.int64]:
     """Return the vertices (4 or 24, d+1), as numbered by `vertices`, of the simplices of a domain.
 
-    A simplex is a facet of the surface, oriented outward, and the middle.  Rotations and mirrors preserve the set.
+    A simplex consists of a facet of the surface, oriented outward, and the middle.  Rotation and mirroring of the
+    domain preserve the set of simplices.
     """
     rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
     facets = []
@@ -168,7 +169,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains are inverted: the volume between the corners is far from their `volume` (n,)."""
+    """Return which domains are inverted, as the volume between their corners is far from their `volume` (n,)."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -622,7 +623,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the next member (n,) in its group after each member, cyclically; group (n,): group of each, ascending."""
+    """Return the index (n,) of the next member of each member's group, cyclically; group (n,): group, ascending."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after

@@ -79,7 +79,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the region (m,) and corners (m, 4, 2) of each new domain, and whether each face (m, 4) is surface."""
+        """Return the index in `cells` (m,), corners (m, 4, 2) and flags of surface faces (m, 4) of each new domain."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]

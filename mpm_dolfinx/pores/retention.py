@@ -252,7 +252,7 @@ class Retentions:
 
     The points' field `retention` is a vector: the number of the law's class (1, 2, ...), then its constants.  The
     number is 0 if the pores stay saturated.  Pieces also have the field `lever`, the vector from the centroid of the
-    material in their cell.  The pressure in a piece is the cell pressure plus the hydrostatic difference over `lever`.
+    material in their cell.  The pressure in a piece is the cell pressure plus the hydrostatic difference along `lever`.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ class Probes:
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values (m, ...) of all probes on every process, from the `values` of the `known` ones on this."""
+        """Return the values (m, ...) of all probes on every process; known: indices of the probes on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)

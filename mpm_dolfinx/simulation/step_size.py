@@ -35,7 +35,7 @@ FINEST = NEAR**2
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""The next / the last adaptive step: SAFETY / (a root of the relative error), within SHRINKS and GROWS; 1 below KEEPS.
+"""Next adaptive step / last one: SAFETY / (a root of the relative error), from SHRINKS to GROWS; 1 instead if < KEEPS.
 
 Source: Hairer, Norsett and Wanner (1993), eq. 4.13; the last Hairer and Wanner (1996), IV.8.
 """
@@ -45,7 +45,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""Ratio of the sudden changes of successive steps, per step length, up to which a change is no jump."""
+"""Ratio of sudden pressure changes per time, in successive steps, up to which the later change is no jump."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
@@ -158,8 +158,8 @@ class StepSize:
         """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content.
 
         The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
-        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent,
-        remains.
+        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent, does
+        not fall with the step.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors until bodies rest at one and slide at another; largest factor, 1 / smallest."""
+"""Ratio of successive trial factors until bodies rest at one and slide at another; limit of F and 1 / F."""
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
@@ -56,8 +56,8 @@ STRAINS = 4.0
 """Strain in a trial of a marginal slide, divided by the elastic strain at yield, or by a smaller overload.
 
 Stresses of soil that begins to flow redistribute within a few strains at yield.  In soft soil such strains would change
-the shape of the body, so the viscosity is larger there.  Half and twice this number change the factor of a slope by 0.5
-%, twice the number of steps changes it by less than 0.1 %.
+the shape of the body, so the viscosity is larger there.  If this number is halved or doubled, the factor of a slope
+changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")

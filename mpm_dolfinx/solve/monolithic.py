@@ -7,11 +7,11 @@
 The solver is GMRES, preconditioned from the right with the upper block triangle. In this the fixed-stress operator P =
 C + beta V approximates the Schur complement C + B K^-1 B^T. One multigrid cycle each approximates K^-1 and P^-1.
 
-In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K. Other methods were slower; they were tested with
-algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15. Conjugate gradients on the Schur complement took 3
-iterations, but 35 to 60 cycles in their inner solves. Flexible GMRES with inner solves to 0.1 or 0.01 took 12 to 24
-cycles. MINRES with the diagonal blocks took 17 to 23 cycles, and left five times the residual. In 2D GMRES takes 8
-iterations to 1e-5, and 12 with algebraic multigrid on P.
+In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods were slower; they were tested
+with algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15.  Conjugate gradients on the Schur complement
+took 3 iterations, but 35 to 60 cycles in their inner solves.  Flexible GMRES with inner solves to 0.1 or 0.01 took 12
+to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles, and left a residual five times as large.  In 2D
+GMRES takes 8 iterations to 1e-5, and 12 with algebraic multigrid on P.
 
 At nu = 0.499 the cycle is poor, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too many
 iterations (see `plan`), or is predicted to, factors of K replace the cycle, and are kept until a solve with them takes

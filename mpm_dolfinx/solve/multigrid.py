@@ -63,7 +63,8 @@ def multigrid_solver(
     name
         Prefix of the solver's PETSc options.
     places : (n, d + 1)
-        Indices >= 0 along the grid axes, and component >= 0, of this process's unknowns. Components are uncoupled.
+        Unknowns of this process: indices along the grid axes and component, all >= 0. Components are interpolated
+        alone.
     held : (m, d + 1)
         Fixed degrees of freedom in cells of bodies; interpolated displacements vanish there.
     nodal

@@ -59,7 +59,7 @@ For a mode with decay rate l, the stability function of sdirk2 gives an error of
 e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
 up, to 0.081 e.  Errors, measured against steps an eighth as long, are 0.05 to 0.08 e under loads and drained pressures
 that rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a consolidation; 0.17 e in a
-first step of a load that grows from zero; 0.26 e after a jump. Errors of a run are thus up to 0.7 to 5 times e / 20.
+first step of a load that grows from zero; 0.26 e after a jump.  The largest error of a run is 0.7 to 5 times e / 20.
 """
 SUDDEN = np.sqrt(2)
 """Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
@@ -387,7 +387,7 @@ class Newton:
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Round-off counts as 0. The stored residual includes it, with a scale of at least round-off / tolerance.
+        Round-off counts as 0. The stored residual includes round-off, with a scale of at least round-off / tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):

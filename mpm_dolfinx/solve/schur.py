@@ -7,9 +7,9 @@
 Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S, preconditioned with the
 fixed-stress operator. For large bodies GMRES solves for both unknowns together, see `monolithic`.
 
-PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, with the same
-digits. A solve takes 0.8 to 1 times as long. But it needs a copy of -B^T for each tangent, and fixed-stress
-iterations would still need the blocks.
+PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, to the same digits.
+A solve takes 0.8 to 1 times as long. But it needs a copy of -B^T for each tangent, and fixed-stress iterations would
+still need the blocks.
 """
 
 from __future__ import annotations

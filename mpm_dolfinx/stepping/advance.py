@@ -255,7 +255,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step, in the shape that laws use.
 
-        It is the mean of Delta F over the pieces, scaled to the mean of its determinant.
+        It is the mean of Delta F over the pieces, scaled so that its determinant is the mean of their determinants.
         """
         pieces = data.pieces
         grid = cut.grid

@@ -574,7 +574,7 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function of (whether a step begins) that returns the fluxes at u.
+        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u; begins: of a step.
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 

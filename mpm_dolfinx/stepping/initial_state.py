@@ -53,7 +53,7 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Number of mixed iterations; PATIENCE: iterations without a reduction of the residual by LESS, after which it ends.
+"""DEPTH iterations are mixed; the last is that after PATIENCE iterations without reduction of the residual by LESS.
 
 Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16 or 80
 and 24 the remaining relative forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 they are up to 6e-3.

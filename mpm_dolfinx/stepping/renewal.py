@@ -185,7 +185,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of all outer faces, and a number for the conditions on each face; -1: not to be renewed."""
+        """Return the keys of all outer faces, and a number for the conditions on each; -1 if they forbid renewal."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
