@@ -111,9 +111,7 @@ def joined_parts(
     pairs (m, 2): active lexicographic cells; each process may have some. All processes must call it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
-    here = grid.owner(cells) == grid.comm.rank
-    of = np.zeros(len(cells), dtype=np.int64)
-    of[here] = part[grid.local(cells[here])]
+    of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.local(cells)], 0)
     one, other = over_all(grid.comm, of, MPI.MAX)[at].reshape(-1, 2).T - 1
     joins = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
     total, new = connected_components(joins, directed=False)
