@@ -61,6 +61,37 @@ def test_soil_that_yields_takes_the_same_step_whatever_others_do(kind):
     assert np.abs(q).max() > 30.0 and off(found, alone) < 1e-9 and told[0] <= 1e-10 and as_is[0] <= 1e-10
 
 
+def touching(kind, group=1, way=0.02):
+    """Return what two blocks in contact show after three steps, next to a third body of one of their groups."""
+    grid = mpm.Grid([0, 0], [4.2, 1.6], [21, 8])
+    bodies = [mpm.box(grid, [0.13, 0.0], [1.33, 0.55]), mpm.box(grid, [0.43, 0.55], [1.03, 0.95])]
+    groups = [[0], [1]]
+    press = mpm.Displacement("top", lambda t, X: (0, -way * min(t, 1.0)), region=((0.4, 0.9), (1.1, 1.0)))
+    conditions = [press]
+    if kind:
+        bodies.append(mpm.box(grid, [2.73, 0.41], [3.31, 0.97]))
+        groups[group].append(2)
+        moves = (lambda t, X: (0.04 * t, 0.02 * t)) if kind == "moves" else (0, 0)
+        conditions.append(mpm.Displacement("bottom", moves, region=((2.0, 0.3), (4.0, 0.6))))
+    given = {"walls": {"bottom": "xy"}, "numerics": mpm.Numerics(tolerance=1e-11)}
+    conditions.append(mpm.Contact(*groups, friction=0.3))
+    s = mpm.Simulation(grid, bodies, [CLAY], conditions=conditions, **given)
+    n, start = sum(map(len, bodies[:2])), s.points.x
+    for _ in range(3):
+        s.step(1.0)
+    return (s.points.x - start)[:n], s.effective_stress()[:n], s.tool_forces.array
+
+
+@pytest.mark.parametrize("way", [0.005, 0.05])
+@pytest.mark.parametrize(("group", "alone"), [(0, None), (1, "rests")])
+def test_bodies_in_contact_are_not_affected_by_the_motion_of_a_body_beyond_their_reach(way, group, alone):
+    """All groups were one part: it was cut anew when the far body moved, which changed displacements by 4e-6.
+
+    The face of the group with the smaller surface is integrated: a far body may make the other one the smaller.
+    """
+    assert off(touching("moves", group, way), touching(alone, group, way)) < 1e-9
+
+
 @pytest.mark.parametrize("stiffer", [1e6, 1e10, 1e14])
 def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
     """Rounding is estimated at each node, and the reported residual includes the soft part's."""

@@ -224,6 +224,10 @@ class Loads:
         """Return unrolled local dofs (n,) on walls, and forces (n,), N, on these that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
+    def within_reach(self) -> NDArray[np.int64]:
+        """Return pairs (m, 2) of lexicographic cells, on this process, that the condition may couple in the step."""
+        return np.empty((0, 2), dtype=np.int64)
+
     def touching(self) -> tuple | None:
         """Return the initial constraints: cells (m,), cells of the other body (m,), positions and directions (m, d).
 

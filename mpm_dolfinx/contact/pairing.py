@@ -323,6 +323,10 @@ class ContactLoads(ContactProblem):
         super().__init__(law, origin, again=again, cell_pairs=cell_pairs)
         self._contacts, self._cut = contacts, cut
 
+    def within_reach(self) -> NDArray[np.int64]:
+        """Return the pairs of cells of bodies that may touch in the step."""
+        return np.stack(np.divmod(self._cell_pairs(), len(self.grid.owners)), axis=1)
+
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
         """Return which corners are near other groups."""
         return self._contacts.near(self._cut, points, corners)

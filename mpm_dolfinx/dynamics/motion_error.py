@@ -15,12 +15,7 @@ from mpm_dolfinx.solve.schur import LinearSolvers
 
 
 def motion_error(
-    solvers: LinearSolvers,
-    K: PETSc.Mat,
-    mass: Mass,
-    flights: Sequence[Flight],
-    seconds: float,
-    own: float,
+    solvers: LinearSolvers, K: PETSc.Mat, mass: Mass, flights: Sequence[Flight], seconds: float, own: float
 ) -> tuple[float, float]:
     """Return estimated error and size of a step's motion, both as square roots of twice an energy, J^(1/2).
 
@@ -40,10 +35,7 @@ def motion_error(
     first, last = flights
     rate, M = 1 / own**2, mass.M
     energy = 0.0
-    for one, other, stiff in (
-        (first.acceleration, last.acceleration, False),
-        (first.velocity, last.velocity, True),
-    ):
+    for one, other, stiff in ((first.acceleration, last.acceleration, False), (first.velocity, last.velocity, True)):
         off = other - one
         off.scale(ERROR * seconds)
         filtered = off.duplicate()

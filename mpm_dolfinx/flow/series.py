@@ -72,10 +72,7 @@ class Through(NamedTuple):
 def none(count: int, laws: int, slots: int) -> Paths:
     """Return paths (count, ...) that conduct nothing."""
     return Paths(
-        np.zeros((count, laws)),
-        np.full((count, slots), -1),
-        np.zeros((count, slots)),
-        np.zeros((count, slots)),
+        np.zeros((count, laws)), np.full((count, slots), -1), np.zeros((count, slots)), np.zeros((count, slots))
     )
 
 

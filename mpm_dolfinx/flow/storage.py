@@ -237,12 +237,7 @@ class StorageSystem:
     """
 
     def __init__(
-        self,
-        forms: StorageForms,
-        cells: NDArray[np.int32],
-        facets: NDArray[np.int32],
-        momentum: Unknowns,
-        parts: Parts,
+        self, forms: StorageForms, cells: NDArray[np.int32], facets: NDArray[np.int32], momentum: Unknowns, parts: Parts
     ):
         self._forms = forms
         self.symmetric = not forms.retains

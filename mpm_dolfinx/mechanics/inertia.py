@@ -282,13 +282,7 @@ class Mass:
     """
 
     def __init__(
-        self,
-        forms: InertiaForms,
-        cut: CutDomains,
-        pieces: PointData,
-        unknowns: Unknowns,
-        M: PETSc.Mat,
-        held: PETSc.Mat,
+        self, forms: InertiaForms, cut: CutDomains, pieces: PointData, unknowns: Unknowns, M: PETSc.Mat, held: PETSc.Mat
     ):
         self._forms, self._cut, self._pieces, self.unknowns, self.M, self.held = forms, cut, pieces, unknowns, M, held
         self._solver = ksp = PETSc.KSP().create(unknowns.comm)

@@ -235,15 +235,8 @@ class MomentumForms:
         return values_at[nodes * d]
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
-        """Return the connected parts of the bodies in active cells; of, count: result of `parts_of_cells`.
-
-        With several groups of bodies there is one part, because contact couples the groups.
-        """
+        """Return the connected parts of the bodies in active cells; of, count: result of `OnGrid.parts_of_cells`."""
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
-        if grid.copies > 1:
-            cells = np.full(grid.num_local, -1)
-            cells[self.active.now.cells] = nodes[self.active.now.nodes] = 0
-            return Parts(1, cells, nodes)
         own = self.active.now.cells[self.active.now.cells < grid.num_owned]
         total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
         nodes[self.active.now.nodes] = np.rint(total / count_of).astype(np.int64) - 1

@@ -103,6 +103,21 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     return out, count
 
 
+def joined_parts(
+    grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], int]:
+    """Return the parts of cells and their number, as `parts_of_cells`, with the parts of some pairs of cells joined.
+
+    pairs (m, 2): active lexicographic cells; each process may have some. All processes must call it.
+    """
+    cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
+    of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.local(cells)], 0)
+    one, other = over_all(grid.comm, of, MPI.MAX)[at].reshape(-1, 2).T - 1
+    joins = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
+    total, new = connected_components(joins, directed=False)
+    return np.append(0, new + 1)[part], total
+
+
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (n,), from 0, of cells by indices and copy (n, d + 1), and the number of parts."""
     if not len(index):

@@ -132,7 +132,7 @@ class Motion:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
                 points = replace(state.points.strained(F), x=x, corners=corners)
-                keeps, folded = on_grid.valid(points), 0
+                keeps, folded = on_grid.valid(points, loads), 0
             self._check_volumes(points, cut)
             if carried is not None:
                 part, count = on_grid.parts
@@ -311,7 +311,7 @@ class Motion:
         for one in loads:
             corners = one.outside(corners, own)
         points = replace(state.points, corners=corners)
-        keeps, evolved = on_grid.valid(points), self._materials.evolved(points)
+        keeps, evolved = on_grid.valid(points, loads), self._materials.evolved(points)
         if over_all(grid.comm, int(not keeps.all())):
             free &= ~keeps[:, None, None]
             corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)

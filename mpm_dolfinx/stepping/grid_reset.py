@@ -35,6 +35,7 @@ from mpm_dolfinx.mechanics.ghost_penalty import FULL, stiffness
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.parts import joined_parts
 from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
@@ -407,13 +408,17 @@ class OnGrid(Keyed):
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return (self.contents.total(moves) == 0).nonzero()[0]
 
-    def valid(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) keep their pieces: their connected part, or with groups all bodies, hardly move."""
-        all_of_them = self.cut.valid(points, np.zeros(len(points), dtype=np.int64), 1)[0]
-        part, count = (0, 1) if all_of_them or self.cut.grid.copies > 1 else self.parts
-        if count == 1:
-            return np.full(len(points), all_of_them)
+    def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
+        """Return which points (n,) keep their pieces: their connected part, with parts in contact, hardly moves."""
+        part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
         return self.cut.valid(points, part, count)[part]
+
+    def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
+        """Return the connected parts of cells, as `ActiveSet.parts_of_cells`; parts that may touch are one part."""
+        if self.cut.grid.copies == 1:
+            return self.active.parts_of_cells
+        pairs = np.concatenate([one.within_reach() for one in loads])
+        return joined_parts(self.cut.grid, *self.active.parts_of_cells, pairs)
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
@@ -421,7 +426,10 @@ class OnGrid(Keyed):
 
         The unknowns of a part are independent of all other parts.
         """
-        part, count = self.active.parts_of_cells
+        return self._of_points(*self.active.parts_of_cells)
+
+    def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
+        """Return the part (n,) of each point, from 0, by the parts of cells, from 1; and the number of parts."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -450,6 +458,8 @@ class System:
         Whether plates or prescribed displacements have a penalty.
     symmetric
         Whether the tangent of the momentum is symmetric.
+    loads
+        Loads at the positions at which domains were cut.
     """
 
     def __init__(
@@ -461,12 +471,13 @@ class System:
         dofs: NDArray[np.int64],
         stiff: bool,
         symmetric: bool,
+        loads: Sequence[Loads],
     ):
         self._scheme = scheme
         self.symmetric = symmetric
         self.storage = None
         own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
-        parts = momentum.parts(*on_grid.active.parts_of_cells)
+        parts = momentum.parts(*on_grid.parts_of_cells(loads))
         self.momentum = MomentumSystem(momentum, dofs, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -652,7 +663,7 @@ def assembled(
     def make() -> System:
         if not stage.inertia and not any(one.holding for one in loads):
             check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
-        return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric)
+        return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric, loads)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with _compat.Timer("integration data"):

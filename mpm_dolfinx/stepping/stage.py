@@ -50,16 +50,7 @@ from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
 Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Tied | Drained | Inflow | Rain | Tool | Contact
 """Conditions on the bodies."""
-KINDS: tuple[type[Acting], ...] = (
-    Tractions,
-    Pressures,
-    Plates,
-    GivenDisplacements,
-    QuietSides,
-    Ties,
-    Tools,
-    Contacts,
-)
+KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, QuietSides, Ties, Tools, Contacts)
 """Loads in the balance of momentum, for conditions without a method `acting`."""
 FED: tuple[type[Feeding], ...] = (DrainedSides,)
 """Terms in the balance of fluid, for conditions without a method `feeding`."""

@@ -39,12 +39,7 @@ from tqdm import tqdm
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged, Report
-from mpm_dolfinx.base.fluid_content import (
-    change_of_content,
-    density_between,
-    mass_potential,
-    mass_potential_form,
-)
+from mpm_dolfinx.base.fluid_content import change_of_content, density_between, mass_potential, mass_potential_form
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
