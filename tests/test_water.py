@@ -99,7 +99,7 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(warned):
     [
         ({"level": np.nan}, "water: level = nan"),
         ({"level": 1.0, "unit_weight": 0.0}, "water: unit_weight = 0"),
-        ({"level": 1.0, "side": 3}, "side 3"),
+        ({"level": 1.0, "side": 3}, "side = 3"),
     ],
 )
 def test_water_that_is_none_is_refused(arguments, said):

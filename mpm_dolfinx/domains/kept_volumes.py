@@ -9,9 +9,9 @@ corners of yielded domains therefore move by the smallest d with
     sum_p V_p [(V_p - V - dV/dx d) / V_p]^2 + SOFT^2 sum_p V_p mean |d / h|^2  ->  min,
 
 with the volumes V_p of points and V of their domains, and the mean of the corners' motions in cells of size h.  Both
-sums are integrals over the material, so a slice between smooth walls in 3D moves as in plane strain.  Shared corners move together.  Corners of elastic domains and
-held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
-projection); volumes of domains, unlike densities, need no second cut by the grid.
+sums are integrals over the material, so a slice between smooth walls in 3D moves as in plane strain.  Shared corners
+move together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of
+grid cells in this way (implicit density projection); volumes of domains, unlike densities, need no second cut.
 """
 
 from __future__ import annotations
