@@ -2,7 +2,6 @@
 """Bodies from meshes: cells are the points' domains, facets the sides."""
 
 import signal
-from concurrent.futures import ThreadPoolExecutor
 
 from mpi4py import MPI
 
@@ -560,11 +559,6 @@ def test_a_polygon_in_national_coordinates_is_filled():
     grid = mpm.Grid(origin, np.add(origin, [6, 3]), [24, 12])
     body = mpm.polygon(grid, np.add(origin, [(0, 0), (5, 0), (3, 2), (1, 2)]), ["base"] * 4)
     assert np.abs(volumes(body.corners())).sum() == pytest.approx(7.0, rel=1e-8)
-
-
-def test_a_polygon_may_be_meshed_in_any_thread():
-    with ThreadPoolExecutor() as pool:
-        assert volumes(pool.submit(outlined, size=0.2).result().corners()).sum() == pytest.approx(1.5)
 
 
 def test_holes_are_sides_and_other_gmsh_models_stay():

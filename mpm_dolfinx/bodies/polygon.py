@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
@@ -160,7 +159,7 @@ def _gmsh() -> Iterator:
         gmsh.option.setNumber("General.Terminal", verbosity)
         if reports and not running:
             gmsh.finalize()
-        if handler is not None and threading.current_thread() is threading.main_thread():
+        if handler is not None:
             signal.signal(signal.SIGINT, handler)
 
 
