@@ -6,12 +6,11 @@ cell, and edges stay straight.  In elastic soil F and the volume ratios of cells
 soil F is incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the
 corners of yielded domains therefore move by the smallest d with
 
-    sum_p V_p [(V_p - V - dV/dx d) / V_p]^2 + SOFT^2 sum_p V_p mean |d / h|^2  ->  min,
+    sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2  ->  min,
 
-with the volumes V_p of points and V of their domains, and the mean of the corners' motions in cells of size h.  Both
-sums are integrals over the material, so a slice between smooth walls in 3D moves as in plane strain.  Shared corners
-move together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of
-grid cells in this way (implicit density projection); volumes of domains, unlike densities, need no second cut.
+with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
+held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
+projection); volumes of domains, unlike densities, need no second cut by the grid.
 """
 
 from __future__ import annotations
@@ -86,16 +85,14 @@ def _motion(
     count = int(number.max(initial=-1)) + 1
     held = np.stack([np.bincount(number.ravel(), ~free[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(corners[yielded], grid.axisymmetric)
-    at, whole = number[yielded], volume[yielded]
-    h = np.broadcast_to(grid.sizes_at(corners[yielded].mean(axis=1)).min(axis=-1), len(at))
-    weight = np.bincount(at.ravel(), (whole / h**2 / at.shape[1]).repeat(at.shape[1]), count)
-    scale = 1 / np.sqrt(np.where(weight > 0, weight, 1.0))
-    values = slope / np.sqrt(whole)[:, None, None] * scale[at][:, :, None] * ~held[at]
+    size = np.linalg.norm(slope, axis=(1, 2))
+    at = number[yielded]
     columns = at[:, :, None] * d + np.arange(d)
+    values = slope / size[:, None, None] * ~held[at]
     starts = np.arange(len(at) + 1) * columns[:1].size
     A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
-    motion = lsmr(A, (whole - now) / np.sqrt(whole), damp=SOFT, atol=SAME, btol=SAME)[0]
-    return (motion.reshape(-1, d) * scale[:, None])[number]
+    missing = (volume[yielded] - now) / size
+    return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
 
 
 def _joined(
