@@ -70,11 +70,19 @@ class Motion:
         All bodies of the scene.
     momentum, storage
         Forms of the two balances, with u and p of a solved step; storage is None without fluid.
+    keep_volumes
+        Whether yielded domains keep the volumes of their points, see `kept_volumes`.
     """
 
     def __init__(
-        self, materials: SceneMaterials, bodies: Sequence[Body], momentum: MomentumForms, storage: StorageForms | None
+        self,
+        materials: SceneMaterials,
+        bodies: Sequence[Body],
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        keep_volumes: bool = False,
     ):
+        self._keep_volumes = keep_volumes and materials.evolves
         self._materials = materials
         self._momentum = momentum
         self._storage = storage
@@ -140,7 +148,7 @@ class Motion:
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
-            if cut.domains and self._materials.evolves:
+            if self._keep_volumes:
                 points = self._corrected(points, state, loads, keeps)
             carried = None
             if self._storage is not None:
