@@ -7,7 +7,7 @@ import pytest
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains.domain_gradient import volume_slopes
-from mpm_dolfinx.domains.kept_volumes import with_volumes
+from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
 from mpm_dolfinx.points.cutting import corner_bits, domain_volumes
 
 WEIGHT, STRONG = 20e3, 5e3  # N/m3, Pa
@@ -82,9 +82,11 @@ def test_shared_corners_move_together_and_held_ones_stay(dim):
     free[:, :, 0] = False
     yielded = ids > 0
     number = body.nodes(ids)
-    domains = ids, corners, volume, yielded, free, 0 * ids
-    moved = with_volumes(grid, *domains, number)
-    assert with_volumes(grid, *domains, 0 * number - 1) == pytest.approx(moved, abs=1e-12)  # as if renewed
+    domains = Domains(ids, corners, volume, yielded, free, 0 * ids, number)
+    moved = with_volumes(grid, domains)
+    assert with_volumes(grid, domains._replace(number=0 * number - 1)) == pytest.approx(
+        moved, abs=1e-12
+    )  # as if renewed
     motion = moved - corners
     for k in np.unique(number):
         assert np.ptp(motion[number == k], axis=0).max() < 1e-12

@@ -15,6 +15,8 @@ projection); volumes of domains, unlike densities, need no second cut by the gri
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
@@ -33,65 +35,44 @@ Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.
 """
 
 
-def with_volumes(
-    grid: Grid,
-    ids: NDArray[np.int64],
-    corners: NDArray[np.float64],
-    volume: NDArray[np.float64],
-    yielded: NDArray[np.bool_],
-    free: NDArray[np.bool_],
-    body: NDArray[np.int64],
-    number: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), m, after the correction; one process computes it.
+class Domains(NamedTuple):
+    """Particle domains of n points."""
 
-    Parameters
-    ----------
-    ids : (n,)
-        Numbers of the points.
-    corners : (n, 2^d, d), m
-        Corners of the domains.
-    volume : (n,), m^d
-        Volumes of the points, > 0; in axisymmetry volumes of their rings, m^3.
-    yielded : (n,)
-        Whether to correct the domain.
-    free : (n, 2^d, d)
-        Components of corners that may move.
-    body, number : (n,), (n, 2^d)
-        Bodies, and numbers of the corners as seeded, >= 0; -1 for renewed domains.
-    """
-    root = to_root(grid.comm, len(ids))
-    columns = (ids, corners, volume, yielded, free & yielded[:, None, None], body, number)
-    rows = [root.send(values) for values in columns]
-    motion = np.zeros_like(rows[1])
+    ids: NDArray[np.int64]  # numbers of the points (n,)
+    corners: NDArray[np.float64]  # corners (n, 2^d, d), m
+    volume: NDArray[np.float64]  # volumes of the points (n,), m^d, > 0; in axisymmetry of their rings, m^3
+    yielded: NDArray[np.bool_]  # whether to correct the domain (n,)
+    free: NDArray[np.bool_]  # components of corners (n, 2^d, d) that may move
+    body: NDArray[np.int64]  # bodies (n,)
+    number: NDArray[np.int64]  # numbers of the corners as seeded (n, 2^d), >= 0; -1 for renewed domains
+
+
+def with_volumes(grid: Grid, domains: Domains) -> NDArray[np.float64]:
+    """Return the corners (n, 2^d, d), m, after the correction; one process computes it."""
+    root = to_root(grid.comm, len(domains.ids))
+    rows = Domains(*map(root.send, domains))
+    motion = np.zeros_like(rows.corners)
     if grid.comm.rank == 0:
-        order = rows[0].argsort()  # sums do not depend on the processes
-        motion[order] = _motion(grid, *(values[order] for values in rows[1:]))
-    return corners + root.back(motion)
+        order = rows.ids.argsort()  # sums do not depend on the processes
+        motion[order] = _motion(grid, Domains(*(values[order] for values in rows)))
+    return domains.corners + root.back(motion)
 
 
-def _motion(
-    grid: Grid,
-    corners: NDArray[np.float64],
-    volume: NDArray[np.float64],
-    yielded: NDArray[np.bool_],
-    free: NDArray[np.bool_],
-    body: NDArray[np.int64],
-    number: NDArray[np.int64],
-) -> NDArray[np.float64]:
+def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     """Return the motion (n, 2^d, d), m, of the corners of all domains."""
-    d = grid.dim
-    number = _joined(body, number, corners, NEAR * grid.least)
+    d, yielded = grid.dim, domains.yielded
+    number = _joined(domains.body, domains.number, domains.corners, NEAR * grid.least)
     count = int(number.max(initial=-1)) + 1
-    held = np.stack([np.bincount(number.ravel(), ~free[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
-    now, slope = volume_slopes(corners[yielded], grid.axisymmetric)
+    fixed = ~(domains.free & yielded[:, None, None])
+    held = np.stack([np.bincount(number.ravel(), fixed[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
+    now, slope = volume_slopes(domains.corners[yielded], grid.axisymmetric)
     size = np.linalg.norm(slope, axis=(1, 2))
     at = number[yielded]
     columns = at[:, :, None] * d + np.arange(d)
     values = slope / size[:, None, None] * ~held[at]
     starts = np.arange(len(at) + 1) * columns[:1].size
     A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
-    missing = (volume[yielded] - now) / size
+    missing = (domains.volume[yielded] - now) / size
     return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
 
 

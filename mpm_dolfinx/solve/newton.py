@@ -332,13 +332,13 @@ class Newton:
         if not negative_pivots(self._solvers.solve_u):
             return
         self._linearise()  # the last tangent may belong to another state
-        if not negative_pivots(self._solvers.solve_u):
+        if not (count := negative_pivots(self._solvers.solve_u)):
             return
         self._solvers.solve_momentum()
         self._move(-np.ones(self._momentum.system.of_parts.count))
         errors = self._errors()
         self._linearise()
-        if (count := negative_pivots(self._solvers.solve_u)) or errors.worst > self._scheme.tolerance:
+        if negative_pivots(self._solvers.solve_u) or errors.worst > self._scheme.tolerance:
             why = f"the equilibrium is unstable, its tangent has {count} negative eigenvalues"
             raise NotConverged(why, self.report.history)
 
@@ -460,7 +460,7 @@ class Newton:
         of = self._momentum.system.of_parts
         moved = np.zeros(of.count)
         steps = moved + 1.0
-        first = moved if elastic else self._work()  # without yield it is not used
+        first = np.empty(0) if elastic else self._work()  # without yield it is not used
         if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)

@@ -20,7 +20,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
-from mpm_dolfinx.domains.kept_volumes import with_volumes
+from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
 from mpm_dolfinx.domains.lattice import filtered, given, seeded, stopped
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
@@ -80,7 +80,7 @@ class Motion:
         bodies: Sequence[Body],
         momentum: MomentumForms,
         storage: StorageForms | None,
-        keep_volumes: bool = False,
+        keep_volumes: bool,
     ):
         self._keep_volumes = keep_volumes and materials.evolves
         self._materials = materials
@@ -352,8 +352,9 @@ class Motion:
             held |= one.near(state.points, points.corners)
         walls = stage.conditions["walls"]
         own = ~given(grid, stage.lattices, walls, points)
-        domains = points.id, points.corners, points.volume0 * points.J, yielded, own & ~held[:, :, None]
-        corners = with_volumes(grid, *domains, self._body(points), number)
+        free, body = own & ~held[:, :, None], self._body(points)
+        domains = Domains(points.id, points.corners, points.volume0 * points.J, yielded, free, body, number)
+        corners = with_volumes(grid, domains)
         corners[yielded] = stopped(grid, walls, corners[yielded], points.corners[yielded])
         for one in loads:
             corners = one.outside(corners, own)
