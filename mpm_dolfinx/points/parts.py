@@ -71,6 +71,31 @@ class OfParts:
         return self.sums(np.ones(len(self.of)))
 
 
+def largest_of_bodies(
+    comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
+
+    Parameters
+    ----------
+    comm
+        The processes.
+    part : (m,)
+        Connected part of each value, from 0.
+    values : (k, m)
+        Values of this process.
+    inside : (bodies, parts)
+        Whether this process has points of the body in the part.
+    """
+    largest = np.full((len(values), inside.shape[1]), -np.inf)
+    for row, found in zip(values, largest, strict=True):
+        np.maximum.at(found, part, row)
+    together = over_all(comm, np.concatenate([largest, inside]), MPI.MAX)
+    largest, inside = together[: len(values), None], together[len(values) :] > 0
+    found = np.where(inside, largest, -np.inf).max(axis=2, initial=-np.inf)
+    return np.where(inside.any(axis=1), found, 0.0)
+
+
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:

@@ -147,7 +147,8 @@ class StepSize:
         A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
         jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
         """
-        return report.sudden - AGAIN * control.first * size > RINGS * control.change
+        excess = report.sudden - AGAIN * size * np.asarray(control.first)
+        return bool((excess > RINGS * np.asarray(control.change)).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
         """Return (length of a step with the tolerated error) / (length of the solved step)."""
@@ -163,7 +164,7 @@ class StepSize:
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
-        allowed = self.rtol * max(control.change, report.sealed)
+        allowed = self.rtol * max(*control.change, report.sealed)
         wrong, filled = report.fills
         errors = [
             (report.error, allowed),
@@ -175,11 +176,14 @@ class StepSize:
 
 def measured(control: StepControl, report: Report, result: Result) -> StepControl:
     """Return the step control with the largest changes of pressure, motion and water content so far."""
-    change = max(control.change, report.change, NEAR * report.stress)
-    if len(result.rows) and len(start := result.pressure[0]) and report.extremes is not None:
-        change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start.tolist(), strict=True)))
+    change = np.maximum(np.maximum(control.change, report.change), NEAR * report.stress)
+    start = control.start
+    if report.extremes is not None:
+        start = report.extremes[0].tolist() if start is None else start
+        change = np.maximum(change, np.abs(report.extremes[1] - start).max(axis=0))
     motion = None if control.motion is None else max(control.motion, report.moves[1])
-    return replace(control, change=change, motion=motion, filled=max(control.filled, report.fills[1]))
+    filled = max(control.filled, report.fills[1])
+    return replace(control, change=change.tolist(), start=start, motion=motion, filled=filled)
 
 
 class Times:

@@ -249,7 +249,7 @@ def _histories(
     control = simulation.state.control
     if after is None:
         motion = 0.0 if rule.by_error and state.stage.inertia else None
-        before = 0.0 if control is None else control.first
+        before = (0.0,) if control is None else control.first
         fresh = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), fresh
     if latest is None or control is None or after.rows.run is not latest.rows.run:
@@ -314,7 +314,7 @@ def _accepted(
     """Return the state after a step of length `size`, s, with its histories; preferred: nominal step, s."""
     grown = measured(start.control, report, start.result)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
-    grown = replace(grown, first=0.0 if new.stays else report.first / size)
+    grown = replace(grown, first=(0.0,) if new.stays else (report.first / size).tolist())
     return replace(new, result=start.result.after(report), control=grown)
 
 

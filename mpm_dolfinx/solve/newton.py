@@ -156,6 +156,7 @@ def note_pressures(
     seconds: float,
     dt: float,
     rates: Sequence[Rates],
+    of_bodies: Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]],
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
@@ -169,6 +170,8 @@ def note_pressures(
         Weight of the first rates in the step, s.
     dt
         Length of the step, s.
+    of_bodies
+        Function of active owned cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -180,15 +183,15 @@ def note_pressures(
     if len(rates) > 1:
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
         sealed = storage.sealed(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
-    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second, sealed)]
+    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, sealed)]
     filling = storage.filling(error) if forms.retains else (error[:0], error[:0])
     largest += [values.max(initial=0.0) for values in filling]
-    largest += [values.max(initial=-np.inf) for values in (-p, p)]
-    largest = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
-    report.error, report.change, report.first, second, report.sealed, *fills, low, high = largest
+    report.error, report.sealed, *fills = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
     report.fills = tuple(fills)
-    report.extremes = (-low, high)
-    report.sudden = report.first if len(rates) > 1 and second < SUDDEN * report.first else 0.0
+    changes = storage.fill * np.abs([p - start, first, second])
+    report.change, report.first, second, *ends = of_bodies(owned, np.concatenate([changes, [-start, start, -p, p]]))
+    report.extremes = np.reshape(ends, (2, 2, -1)) * [[-1.0], [1.0]]
+    report.sudden = np.where(len(rates) > 1 and second < SUDDEN * report.first, report.first, 0.0)
 
 
 class Newton:

@@ -41,6 +41,7 @@ from mpm_dolfinx.points.material_points import (
     in_space,
     with_ratio,
 )
+from mpm_dolfinx.points.parts import largest_of_bodies
 from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay, Trend
@@ -216,10 +217,10 @@ class Motion:
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t, s, up to a constant.
 
-        The result is None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the cut.
+        The result is None without gravity. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None or self._storage.fluxes.flux is None:
+        if gravity is None:
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
@@ -418,6 +419,13 @@ class Motion:
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
         return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
+
+    def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the largest values (k, bodies) of each body; values (k, m): of these active owned cells (m,)."""
+        (part, count), points = on_grid.active.parts_of_cells, on_grid.cut.points
+        inside = np.zeros((len(self._bodies), count), dtype=bool)
+        inside[self._body(points), on_grid.parts[0]] = True
+        return largest_of_bodies(self._momentum.grid.comm, part[cells] - 1, values, inside)
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the index of each point's body (n,)."""

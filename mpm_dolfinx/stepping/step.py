@@ -64,7 +64,8 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
         earlier = [one.flown(both.momentum.at) for one in acting.loads]
-    note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
+    bodies = partial(scene.motion.of_bodies, on_grid)
+    note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates, bodies)
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers
     start.matrices.end_step()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -18,10 +19,12 @@ class StepControl:
         Next trial step.
     waits, kept
         See `StepSize.grown`.
-    change : Pa
-        Largest pressure change since the start of the run.
-    first : Pa/s
+    change : (bodies,), Pa
+        Largest pressure change of each body since the start of the run.
+    first : (bodies,), Pa/s
         Value `sudden` of the last step in `Report`, divided by the length of the step, if the grid was reset.
+    start : (2, bodies), Pa
+        Smallest and largest cell pressures of each body at the start of the run; None before the first step.
     motion : J^(1/2)
         Largest motion since the start of the run, see `motion_error`; None if unused.
     filled
@@ -32,7 +35,8 @@ class StepControl:
     small: float = 0.0
     waits: int = 0
     kept: int = 1
-    change: float = 0.0
-    first: float = 0.0
+    change: Sequence[float] = (0.0,)
+    first: Sequence[float] = (0.0,)
+    start: Sequence[Sequence[float]] | None = None
     motion: float | None = None
     filled: float = 0.0
