@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid with the magnitude of the scene's gravity, m/s^2, if constant, to convert its conductivity."""
+    """Return the fluid.  If the scene's gravity, m/s^2, is constant, it converts the fluid's conductivity."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -90,11 +90,13 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(comm, ConditionWarning, f"{what}: at one level they are not in equilibrium", name, weight, of, own)
+            warn(comm, ConditionWarning, f"{what}: at one level, both are not in equilibrium", name, weight, of, own)
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return a constant gravity, m/s^2, that differs from the one with which conductivities are converted, else None.
+    """Return the last gravity, m/s^2, if conductivities are converted with another one, else None.
+
+    A gravity that varies in the step counts only if it exceeds the standard gravity.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ def motion_error(
     flights
         States of motion after the two substeps.
     seconds, own
-        Time weights, s, of the first rate of two, and of the last rate.
+        Time weights in the last substep, s: `seconds` of the rate in the first substep, `own` of the rate in the last.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M
