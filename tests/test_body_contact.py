@@ -265,7 +265,7 @@ def test_what_are_no_contacts_is_refused():
         scene(boxes[:2], mpm.Contact(0, [0, 1]))
     with pytest.raises(ValueError, match=r"body 2 is in no group, must be in one"):
         scene(boxes, mpm.Contact(0, 1))
-    with pytest.raises(ValueError, match=r"groups \(0,\) and \(2,\) have 0, must have one contact"):
+    with pytest.raises(ValueError, match=r"groups \(0,\) and \(2,\) have 0 contacts, must have one"):
         scene(boxes, mpm.Contact(0, 1), mpm.Contact(1, 2))
     with pytest.raises(ValueError, match=r"body 1 is in the groups .*, must be in one; name all"):
         scene(boxes, mpm.Contact(0, [1, 2]), mpm.Contact(0, 1))

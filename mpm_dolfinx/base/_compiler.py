@@ -55,8 +55,7 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
     Raises
     ------
     OSError
-        Settings are unreadable, no folder is writable, or the C compiler fails.  All processes raise the error, and its
-        message is one line.
+        Settings are unreadable, no folder is writable, or the C compiler fails.  All processes raise the error.
     """
     folder = at_root(comm, _folder)
     messages = [""]

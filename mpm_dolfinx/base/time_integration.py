@@ -9,10 +9,9 @@ zeta' + Q(u, p) = 0 with the net outflow Q.  With the subscript n at the start o
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
 With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method does not use the
-rate at the start of the step; the transfer between grids would make this rate noisy.  (u2, p2) are the values at the
-end of the step.  After a jump of the loads, one long step overshoots by a fifth, but two steps of half the length do
-not, see `step_size`.  The error of a step is estimated from the rates of the two substeps, see
-`solve.newton.note_pressures`.
+rate at the start of the step, which is noisy after a transfer between grids.  (u2, p2) are the values at the end of the
+step.  After a jump of the loads, one long step overshoots by a fifth, but two steps of half the length do not, see
+`step_size`.  The error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations

@@ -440,9 +440,8 @@ class Displacement(Condition):
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves the body over
-        half a cell outside the box.  If the box covers at most half of its last cell, the far node of that cell is not
-        prescribed.
+        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell of
+        the side outside the box.  If the box covers at most half of its last cell, the cell's far node stays free.
 
     Raises
     ------

@@ -282,8 +282,8 @@ class Cone:
 class Distance:
     """A shape given by a user's signed distance function, with derivatives by finite differences.
 
-    The function is evaluated at true positions.  Increments are powers of two, so that distinct positions do not round
-    to the same value.
+    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two, so
+    that distinct positions do not round to the same value.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m
