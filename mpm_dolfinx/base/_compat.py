@@ -222,7 +222,7 @@ class CompiledForm:
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`; ghosts keep their values.  `rows`, one per entity, replace dolfinx's coefficients."""
+        """Add the vector to `b`, without communication.  `rows`, one per entity, replace dolfinx's coefficients."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)

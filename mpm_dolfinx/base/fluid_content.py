@@ -69,7 +69,7 @@ def mass_potential_form(p, compliance):
 
 
 def density_between(p0, p1, compliance):
-    """Return the logarithmic mean of the densities at two pressures / density at zero pressure, as a UFL expression."""
+    """Return (logarithmic mean of the densities at two pressures) / (density at zero pressure), as a UFL expression."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 

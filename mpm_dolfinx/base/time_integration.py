@@ -42,11 +42,11 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement to prescribe at the end of the first substep, so that the method has the exact velocity.
+    """Return the displacement to prescribe at the end of the first substep, so that the velocity there is exact.
 
-    The method computes the velocity v at the end of this substep from the increment of displacement, share dt v.  With
-    the exact displacement, v is first-order accurate, and accelerations do not converge.  This function takes v from
-    the parabola through three displacements, and returns start + share dt v.
+    The method computes this velocity v from the increment of displacement, which equals share dt v.  With the exact
+    displacement, v is first-order accurate, and accelerations do not converge.  This function takes v from the parabola
+    through three displacements, and returns start + share dt v.
 
     `share` is the end of the substep as a fraction of the step.  The displacements are `start` at the
     start of the step, `now` at the end of the substep and `end` at the end of the step.

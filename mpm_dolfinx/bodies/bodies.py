@@ -103,7 +103,7 @@ class Body:
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length on it, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -130,7 +130,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return how far straight edges of each chosen domain deviate from the mapped edges of its box (m,), m.
+        """Return for each chosen domain (m,) how far, m, its straight edges deviate from the mapped edges of its box.
 
         This is the largest distance of midpoints.  Edges of two domains on the same curve may differ by this distance.
         """
@@ -151,7 +151,7 @@ class Body:
 
     @property
     def volume_of_boxes(self) -> float:
-        """Volume of all boxes, m^d, for boxes of equal size."""
+        """Total volume of all boxes, m^d, if these are equal."""
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:

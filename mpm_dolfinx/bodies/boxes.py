@@ -124,7 +124,7 @@ class RowsBody(LatticeBody):
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length on it, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
@@ -136,7 +136,7 @@ class RowsBody(LatticeBody):
 
     @property
     def volume_of_boxes(self) -> float:
-        """Volume of all boxes, m^d."""
+        """Total volume of all boxes, m^d."""
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:

@@ -293,7 +293,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return xi (n, 3) in domains (n, 8, 3), with tangential coordinates of x (n, 3), projected onto faces (n,)."""
+    """Return local coordinates xi (n, 3), with the tangential parts of positions x (n, 3) projected onto faces (n,)."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

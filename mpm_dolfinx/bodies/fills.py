@@ -215,7 +215,7 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):
         x = now.reshape(-1, grid.dim)[out[0]] + grid.base
-        raise ValueError(f"{name}; a corner that follows reaches {x}, must be inside {grid.lower} to {grid.upper}")
+        raise ValueError(f"{name}; a corner of the fill moves to {x}, must be inside {grid.lower} to {grid.upper}")
 
 
 def _penetration(

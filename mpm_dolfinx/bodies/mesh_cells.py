@@ -55,9 +55,9 @@ def edges(kind: str) -> list[tuple[int, int]]:
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index of each distinct row of an array (n, k), and the distinct row (n,) equal to each row.
+    """Return the first index in each group of equal rows of an array (n, k), and the group (n,) of each row.
 
-    Distinct rows are sorted.  `np.unique` compares rows as objects and takes five times as long.
+    Groups are sorted by row.  `np.unique` compares rows as objects and takes five times as long.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
@@ -137,8 +137,8 @@ class Polytopes:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the indices (k,) of the pairs of cells i, j (m,) that overlap, and the depths (k,), m, of overlap.
 
-        Two convex cells overlap if no plane separates them.  It is sufficient to try planes normal to the facet normals
-        and, in 3D, to the cross products of edges.  An overlap shallower than `slack` (m,), m, is ignored.
+        Two convex cells overlap if no plane separates them.  It is sufficient to try planes parallel to a facet or, in
+        3D, to an edge of each cell.  An overlap shallower than `slack` (m,), m, is ignored.
         """
         left, depth = np.arange(len(i)), np.full(len(i), np.inf)
         for normals in self._planes():

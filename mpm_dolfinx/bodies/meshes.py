@@ -167,7 +167,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return domains (n, 2^d, d), nodes (n, 2d, 2^(d-1)) of the facet with each face, and the cell of each domain.
+    """Return domains (n, 2^d, d), nodes (n, 2d, 2^(d-1)) of the facet containing each face, and cells of the domains.
 
     Nodes of a facet ascend; a -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
     """

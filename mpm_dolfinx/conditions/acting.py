@@ -3,7 +3,7 @@
 
 The method `acting(setting)` of a condition returns an `Acting`.  See `flow/feeding.py` for conditions on the fluid.
 
-A condition acts through objects of three levels.  `Acting` is created once in a stage and holds the loaded faces.
+A condition acts on three levels: stage, substep, assembly.  `Acting` is created once in a stage and holds loaded faces.
 `Acting.placed` returns the `Loads` of a substep at the current position of the faces.  At each assembly `Loads` add
 forces to the residual and stiffness to the tangent.  The code of the step and of the momentum balance calls only this
 interface, and names no particular condition.
@@ -206,7 +206,7 @@ class Loads:
         return False
 
     def augment(self, at: At) -> bool:
-        """Once equilibrium is reached, update the multipliers; return whether forces changed."""
+        """When equilibrium is reached, update the multipliers; return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:
@@ -221,7 +221,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on these that are not reactions of walls."""
+        """Return unrolled local dofs (n,) on walls, and the forces on them (n,), N, that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -240,7 +240,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` are those without this condition."""
+        """Return rounding errors (cells,), N, of forces in local cells.  `of_cells`: errors without this condition."""
         return of_cells
 
     @property

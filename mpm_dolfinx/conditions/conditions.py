@@ -441,7 +441,7 @@ class Displacement(Condition):
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
         Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell of
-        the side outside the box.  If the box covers at most half of its last cell, the cell's far node stays free.
+        the side outside the box.  If the box covers at most half of its last cell, that cell's far node stays free.
 
     Raises
     ------
@@ -480,7 +480,7 @@ class _OfPlate(Traction):
 class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies: all faces have the same displacement normal to the side.
 
-    A penalty on the slope of the faces, kappa/2 int |grad_t x_n|^2 dA, keeps the plate flat and prevents tilting.  The
+    A penalty on the slope of the faces, kappa/2 int (grad_t x_n)^2 dA, keeps the plate flat and prevents tilting.  The
     penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters

@@ -122,9 +122,9 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `present`.
+        """Return the contact law of pairs that were found for the points `seen`.
 
-        `points` are the points at the start of the step, with the contact history.
+        `points` are the points at the start of the step, with the contact history; `present` are the current points.
         """
         grid = self.grid
         d = self.grid.dim

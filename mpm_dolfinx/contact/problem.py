@@ -8,8 +8,8 @@ at the start of the step.  After convergence they are updated at the new positio
 is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
-the equilibrium of the bodies, by
+the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
+together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 

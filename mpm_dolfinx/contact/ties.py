@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-A penalty resists the difference of the displacements at equal heights: k/2 int |u_one - u_other|^2 dA.  Displacements
+A penalty resists the difference of the displacements at equal heights: k/2 int (u_one - u_other)^2 dA.  Displacements
 are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and opposite.
 """
 

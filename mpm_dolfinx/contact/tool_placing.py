@@ -330,7 +330,7 @@ class Tools(Touching):
     def pushed_out(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return corners of domains after a correction that reduces small penetrations of tools to `LEFT`.
+        """Return corners of domains after a correction that reduces small penetrations into tools to `LEFT`.
 
         Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
 
@@ -343,7 +343,7 @@ class Tools(Touching):
         free : (n, 2^d, d)
             Components that no other condition prescribes.
         most
-            Largest penetration that is corrected, cells.
+            (Largest penetration that is corrected) / cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:

@@ -59,7 +59,7 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 LOSS = 0.03
 """A warning is issued if a soft material loses more than this fraction of its deformation in mixed cells."""
 AGAIN = 2.0
-"""Growth of the lost fraction from one warning to the next, as interfaces move to the middle of cells."""
+"""Factor by which the lost fraction grows between two warnings, as interfaces move to the middle of cells."""
 FINE = 0.1
 """Smallest lost fraction of a cell's deformation that counts; stiffness contrasts below 2.1 lose less."""
 
@@ -166,7 +166,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, with no wall or other body at its two faces across the axis."""
+    """Return whether a body is thin along an axis, with no wall or other body at its two sides normal to the axis."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:
