@@ -53,7 +53,7 @@ def box_mesh(
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
     if OLD:
-        # FFCx sets this variant when it compiles its first form; later libraries would then have other names
+        # FFCx would add this variant itself after its first form, and so change the names of later libraries
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1, variant="equispaced"))
         ghosts = mesh.GhostMode.shared_facet
         lists = cpp.graph.AdjacencyList_int32(*where)

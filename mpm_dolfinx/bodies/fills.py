@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-MISFIT = 0.01  # cells: a fill's straight edges may be this far from a bent surface before a warning is given
+MISFIT = 0.01  # largest (distance of a fill's straight edges from a bent surface) / cell size without a warning
 UPRIGHT = 0.95  # cosine of the largest angle between an axis and normals of mesh faces on the side opposite a contact
 INSIDE = 0.05  # fraction of a domain's shortest edge; deeper penetration into a fill is an error
 

@@ -348,7 +348,7 @@ def _split(
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
     if grid.even:
         longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
-    else:  # edges are measured in cells
+    else:  # edges are divided by the cell size
         y = grid.in_cells(domains - grid.base)
         edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
         longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)

@@ -44,7 +44,7 @@ STIFF = 100.0
 """Stiffness k in units of (resistance) / (cell size)."""
 GRIP = 6.0
 """Stiffness k_t in units of (resistance) / (cell size).  A larger k_t allows shears that cancel at the nodes."""
-DEPTH = 5e-4  # cells: allowed mean penetration
+DEPTH = 5e-4  # allowed mean penetration / cell size
 SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 SLOW, STIFFER = 0.6, 10.0
@@ -62,7 +62,7 @@ class ContactState:
     parts: NDArray[np.bool_]  # whether the condition has opened after this return (k,)
     stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
     raised: float = 1.0  # factor on the stiffness k
-    off: float = np.inf  # penetration after the last augmentation, cells
+    off: float = np.inf  # penetration after the last augmentation / cell size
     rounds: int = 0  # number of augmentations
     follows: int = 0  # number of updates of the pairs
 

@@ -369,7 +369,7 @@ class ContactProblem(Loads):
         _, touches = self._seek(found)
         failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(failed)[:1]:
-            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain it?"
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain the tool?"
             if reaction[k] == 0:
                 why = "there is no contact within a cell: does the tool start at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")

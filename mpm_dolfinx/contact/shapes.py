@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SAME, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-ROUNDED = SAME  # cells: a position penetrating less than this lies on the surface
+ROUNDED = SAME  # penetration / cell size below which a position lies on the surface
 DISTANCE = 0.1
 """Largest deviation of the slope of a user's distance function from 1."""
 

@@ -33,10 +33,10 @@ from mpm_dolfinx.mechanics.given_displacements import held_faces
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # cells: allowed penetration into a body at the start, and into prescribed sides
-NEAR = 0.1  # cells: corners within this distance follow the Q1 field
-STRIDE = 0.02  # cells: a tool thinner than this may pass through points in a step without notice
-LEFT = 1e-3  # cells: penetration that remains at corrected corners; a full projection would roughen the stress
+BEGINS = 1e-2  # allowed penetration / cell size into a body at the start, and into prescribed sides
+NEAR = 0.1  # distance / cell size from a tool below which corners follow the Q1 field
+STRIDE = 0.02  # thickness / cell size of a tool below which it may pass through points in a step without notice
+LEFT = 1e-3  # penetration / cell size that remains at corrected corners; full projection would roughen the stress
 FACING = 0.5  # smallest cosine between the normal of a face and the direction to the tool, if the face faces the tool
 
 
