@@ -30,7 +30,7 @@ def balancing_tractions(
     """Return for each side at rest point ids (m,) and tractions (m, d), Pa, that replace its reactions.
 
     Tractions are forces per reference area, computed from the stresses.  Their resultants and moments on a part of the
-    bodies may differ from those of the reactions.  Rigid-body fields of tractions are added, so that no part moves.
+    bodies may differ from those of the reactions.  Rigid-body fields of tractions remove this difference.
 
     Parameters
     ----------
