@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The axis of revolution of axisymmetric scenes: radial displacements vanish, and holes must be a cell wide."""
+"""The axis of revolution of axisymmetric scenes: radial displacements vanish; holes must be at least a cell wide."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
 def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the fixed components of each wall, with the radial component on the axis."""
+    """Return the fixed components of each wall; the wall on the axis also fixes the radial component."""
     left = walls.get("left", "") if isinstance(walls, Mapping) else None
     if not grid.has_axis or not isinstance(left, str) or "x" in left:
         return walls
@@ -38,6 +38,6 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
     hole = near[~touches[row + 1]]
     if len(hole):  # nodes of the first cells lie on the axis, and are fixed
         k = hole[inner[hole].argmin()]
-        what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves like "
+        what = "a hole of radius %.3g m about the axis, at %s, is narrower than a cell of %.3g m: its side moves like "
         what += "that of a solid core; use smaller cells, or a grid that begins at a radius > 0"
         warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), h)

@@ -16,9 +16,8 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), N, of each wall by name; all processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of them is
-    normal to it, they share the force evenly.
-    The axis of revolution has no area, so its radial force is zero.
+    If several walls fix a component of a node, the wall normal to this component carries the force, or all of them
+    carry it evenly if none is normal.  The axis of revolution has no area, so its radial force is zero.
 
     Parameters
     ----------
