@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. That of a pressure
-is -int p n . v da on the present area. The tangent of this term is symmetric except for the edges dx of the surface,
-which contribute p/2 (v x du) . dx. This contribution vanishes where two surfaces of equal pressure meet. It also
+The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. The virtual work of
+a pressure is -int p n . v da on the present area. The tangent of this term is symmetric except for a contribution p/2
+(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. It also
 vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
 """
 
@@ -179,7 +179,7 @@ class PressureLoads(Loads):
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether each surface of equal pressure is closed, or ends on walls that fix their normal component.
+    """Return whether each surface of equal pressure is closed, or ends on walls that fix the normal displacement.
 
     A surface counts as open if corners of its faces lie on the edges of other faces.
 
