@@ -21,7 +21,7 @@ class StepControl:
     change : Pa
         Largest pressure change since the start of the run.
     first : Pa/s
-        Value `sudden` of the last step in `Report`, divided by the length of the step, if the grid was reset.
+        Value `first` of the last step in `Report`, divided by the length of the step; 0 if all points keep their cut.
     motion : J^(1/2)
         Largest motion since the start of the run, see `motion_error`; None if unused.
     filled
