@@ -124,7 +124,7 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
 
 
 class PressureForms:
-    """Forms of nodal forces and minus their derivative, from a pressure force on the area at the step's start."""
+    """Forms of nodal forces of pressures, and of minus their derivative; `push`: force on the area at the start."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -201,7 +201,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
 
 def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
-    """Return axis and position, m, of each wall that fixes its normal displacement component."""
+    """Return axis and position, m, of each wall that fixes the displacement component normal to the wall."""
     out = []
     for wall, (axis, end) in SIDES[grid.dim].items():
         if not over_all(grid.comm, int(free[grid.wall_nodes(wall), axis].sum())):

@@ -142,7 +142,7 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return for each cell the index of its connected part among those of all processes, and the number of parts.
+    """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
 
     own, count: part of each cell, and number of parts, on this process alone; nodes, of_node (n,): local indices of the
     cells' nodes, and part of each node on this process.

@@ -291,7 +291,7 @@ class Retentions:
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, of pieces minus those of their cells; lever (m, d), m: see the class."""
+        """Return pressure of each piece (m,) minus pressure of its cell, Pa; lever (m, d), m: see the class."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):

@@ -45,7 +45,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""Ratio of sudden pressure changes per time, in successive steps, up to which the later change is no jump."""
+"""A sudden pressure change up to this multiple of the one in the previous step, both per time, is no jump."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10

@@ -326,8 +326,8 @@ class Newton:
         """Raise NotConverged at an unstable equilibrium, because smaller steps find the path that leaves it.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
-        delays buckling. If a step has kept its first tangent, the check follows in the next step. An equilibrium within
-        tolerance may seem unstable where only soft springs resist a motion, so it is corrected once.
+        delays buckling. A tangent that is kept for the whole step shows an instability only in the next step. Where
+        only soft springs resist a motion, an equilibrium within tolerance may seem unstable, so it is corrected once.
         """
         if not negative_pivots(self._solvers.solve_u):
             return

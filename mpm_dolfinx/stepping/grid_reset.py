@@ -561,7 +561,7 @@ class Assembled(Keyed):
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return the rounding error of the residual at the active local nodes (nodes,), N.
 
-        The error is a sum: one term grows with the stiffness of the cells at a node, one with that of penalties there.
+        Two terms are added: one proportional to the stiffness of the cells at a node, one to that of penalties there.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)

@@ -169,7 +169,7 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return a state before the next step, and by data name the points (m,) and tractions (m, d), Pa, on quiet sides.
+    """Return the state reset for a step, and by data name the points (m,) and tractions (m, d), Pa, on quiet sides.
 
     The tractions balance stresses, loads of the previous stage, and remaining supports. after: the new stage.
     """
