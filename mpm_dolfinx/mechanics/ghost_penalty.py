@@ -81,7 +81,7 @@ class GhostPenalty:
     shear
         Shear modulus, Pa, of laws with a state: mean over the material in the cell; zero for other laws.
     firmness
-        Form of the elastic shear stiffness in the cells, times their volume fraction; it regularises tangents.
+        Form that regularises tangents: elastic shear stiffness of the cells times their volume fraction.
     fill, beside
         Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """

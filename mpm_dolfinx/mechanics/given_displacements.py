@@ -349,7 +349,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled dofs (n,), and the penalty forces (n,), N, on them, which are not reactions of walls."""
+        """Return unrolled dofs (n,), and penalty forces (n,), N, on them that do not count as reactions of walls."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

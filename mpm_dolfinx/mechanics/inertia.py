@@ -104,7 +104,7 @@ def moving(
     Parameters
     ----------
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Velocity, or a function of position.  Each domain stores the affine field nearest to its values at the corners.
+        Velocity, or a function of position.  Each domain stores the affine field nearest to the values at its corners.
     base : (d,), m
         Origin of the points' coordinates.
     rings

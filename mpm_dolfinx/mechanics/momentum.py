@@ -521,9 +521,9 @@ class MomentumProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two relative residuals of each connected part: without rounding errors, and with them.
 
-        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node,
-        unless `first` is set, so that one solve is made even for a load below the rounding error.  The second result
-        uses scales of at least the rounding error divided by the tolerance.
+        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node.
+        With `first` it includes this error, so that even a load below the error causes a solve.  The second result uses
+        scales of at least the rounding error divided by the tolerance.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

@@ -101,7 +101,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep; even: loads of their uniform tractions."""
+    """Plates in a substep; even: loads of the plates' uniform tractions."""
 
     stiff = True
 

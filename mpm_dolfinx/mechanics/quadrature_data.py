@@ -32,9 +32,9 @@ STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
 
 The weight is 1 at nu = 0.43, and 0 at 0.47.  The difference between corner-based ratio and Q1 field expels water from
-stiffer skeletons in every step of any length.  With a weight of 1, the extreme pressures of a beam with eight cells
-across its depth have errors of 43 % at nu = 0.49.  At 0.499 they are six to thirty times too large, and adaptive steps
-never grow.
+skeletons above this value in every step of any length.  With a weight of 1, the extreme pressures of a beam with eight
+cells across its depth have errors of 43 % at nu = 0.49.  At 0.499 they are six to thirty times too large, and adaptive
+steps never grow.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.

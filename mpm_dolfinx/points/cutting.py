@@ -624,7 +624,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each member the index of the next in its group, after the last the first; group (n,): ascending."""
+    """Return the index of each member's successor in its group, the first after the last; group (n,): ascending."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after

@@ -96,7 +96,7 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: mean over the domain, second-order accurate. Cells have other pressures.
+        Pore pressure, positive in compression: mean over the domain, second-order accurate; balances use the cells'.
     x : (n, d), m
         Centroid of the domain, in axisymmetry of its section. F and pressure are exact there for linear fields.
     origin : (n, 2^d, d), m

@@ -17,7 +17,7 @@ EDGES = 4
 BENT = 1 - 3**0.5 / 2
 """Deviation of the surface from a chord, in cell sizes, above which it has a corner; flatter parts are divided evenly.
 
-Source: exact, for chord and radius of one cell size each: the grid cannot resolve a smaller circle.
+Source: exact, for a chord of one cell size in a circle of this radius: the grid cannot resolve a smaller circle.
 """
 RING = np.array([0, 1, 3, 2])
 """Corners of a particle domain, anti-clockwise."""

@@ -285,7 +285,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return (work of the viscous stress in a step) / (integral of |deviatoric stress| |deviatoric strain|).
+        """Return (work of the viscous stress in a step) / (integral of the norms of deviatoric stress x strain).
 
         Points that moved to another process are excluded.
         """

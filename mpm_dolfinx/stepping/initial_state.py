@@ -230,7 +230,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError for quiet sides in a stage with another weight, which their tractions do not bear."""
+    """Raise ValueError if a stage with quiet sides changes the weight: the sides' tractions would not bear it."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)

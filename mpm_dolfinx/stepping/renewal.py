@@ -2,7 +2,7 @@
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
 F of yielded soil is updated by increments, so domains serve for integration only. They may be replaced if the new
-domains fill the same region, with the same surface and contents. Cells with a piece of a too long domain (`LONGEST`)
+domains fill the same region, with the same surface and contents. Cells with a piece of a domain longer than `LONGEST`
 are filled anew:
 
 * A full cell is divided into four equal domains.

@@ -81,7 +81,7 @@ class Trend:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
-    """All data of a scene that one step passes to the next; immutable, as a step returns a new state.
+    """All data of a scene that one step passes to the next; immutable: each step returns a new state.
 
     A checkpoint stores all of these data except two: the stage, which the script defines, and the watched points.
 
