@@ -30,7 +30,7 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
-    Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; the first is saturated
+    Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; entry 0 is saturated
     soil.  The other lines are replaced by one line with s soils in series.
     """
 
@@ -79,10 +79,10 @@ def none(count: int, laws: int, slots: int) -> Paths:
 class _Links(NamedTuple):
     """Segments of soil along the flow path through a face.  Each connects two nodes, positions with a pressure."""
 
-    face: NDArray[np.int64]  # the face
+    face: NDArray[np.int64]  # index of the face
     low: NDArray[np.int64]  # first node
     high: NDArray[np.int64]  # second node
-    law: NDArray[np.int64]  # number of the retention curve
+    law: NDArray[np.int64]  # index of the retention curve
     conductance: NDArray[np.float64]  # at k_r = 1, m/(Pa s)
     drop: NDArray[np.float64]  # hydrostatic pressure drop, Pa
 
