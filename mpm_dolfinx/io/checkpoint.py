@@ -117,9 +117,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ----------
     simulation
         The scene of the checkpoint, on any number of processes.  First call `stage`, to bring the scene to the stage of
-        the checkpoint.  Grid, bodies, materials with their fields and laws, and fluid must be the same as in the file.
-        Loads, boundary conditions, terms and sources may differ.  Data that observers have collected are not in the
-        file.
+        the checkpoint.  Grid, bodies, materials with their fields and laws, and fluid must be as in the file.  Loads,
+        boundary conditions, terms and sources may differ.  Data that observers have collected are not in the file.
     file
         The checkpoint.
 

@@ -41,7 +41,7 @@ FIELDS = {
         "reaction_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the prescribed displacement NAME on the bodies",
         "wall_reaction_x_WALL, _y_, _z_": "N, in plane strain N/m, force of a wall of the grid on the bodies",
         "tool_force_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the tool or contact NAME on the bodies",
-        "tool_force_moment_NAME": "N (N m per metre), moment about the tool's centre; in 3D _x, _y, _z, N m",
+        "tool_force_moment_NAME": "N m, in plane strain N, moment about the tool's centre; in 3D _x, _y, _z",
         "tool_travel_NAME": "m, displacement of the tool NAME under its load; of a free tool _x, _y, _z",
         "tool_velocity_x_NAME, _y_, _z_": "m/s, velocity of the free tool NAME",
         "tool_rotation_NAME": "rad, counterclockwise rotation of the free tool NAME, in 2D",

@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return data for forms at the points with indices `rows`; values (n, ...): F, parameters and state of all."""
+        """Return form data at the points with indices `rows`; values (n, ...): F, parameters, state of all points."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube with the volume of a cell, m; in uneven grids, of the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell; in uneven grids, the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -279,7 +279,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces: fields F, position, conductivity and porosity0, if a law is given.
+        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure
