@@ -25,8 +25,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 STILL = 3e-4
 """Largest motion of corners / cell size for which a cut remains valid.  After larger motion the domains are cut again.
 
-Compared with a new cut in every step, STILL changes the pressures in a consolidating column of ten cells by 7e-5 of the
-load, and the settlement by 3e-5 of its value.  Both changes are proportional to STILL.
+Compared with a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
+settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
 """
 
 
@@ -167,7 +167,7 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean of each point's pieces like `mean`; in axisymmetry the weights are areas in the plane.
+        """Return each point's mean over its pieces like `mean`; in axisymmetry the weights are areas in the plane.
 
         `values` are values at the centroids of these areas.
         """

@@ -97,10 +97,8 @@ class LinearGradients:
 
     Parameters
     ----------
-    comm
-        Communicator of the processes.
-    bodies
-        All bodies of the scene.
+    comm, bodies
+        Communicator of the processes, and all bodies of the scene.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):

@@ -68,7 +68,7 @@ def fitted_at(
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return index pairs: of `places` (m, d), and of x (n, d) within `radius` (m,) along each axis; all in m."""
+    """Return index pairs of `places` (m, d) and points x (n, d) within `radius` (m,) along each axis; all in m."""
     low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Particle domains of yielded soil keep the volumes of their points.
 
-The volume ratio of a point is a mean over its cell, but the corners of its domain follow a field that varies in the
-cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In yielded
-soil F is updated by increments, so the volumes of domains and of points would drift apart, and cells would overfill.
-After a step the corners of yielded domains therefore move by the d that minimises
+The volume ratio of a point is a mean over its cell.  The corners of its domain, however, follow a field that varies in
+the cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In
+yielded soil F is updated by increments, so the volumes of domains and of points would drift apart, and cells would
+overfill.  After a step the corners of yielded domains therefore move by the d that minimises
 
     sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2,
 
 with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
 held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
-projection); volumes of domains, unlike densities, need no second cut by the grid.
+projection).  Volumes of domains, unlike densities, need no second cut by the grid.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
-"""Weight of the motion d.  In a regular lattice, no motion of corners changes alternating volumes to first order.
+"""Weight of the motion d, needed because in regular lattices no motion changes alternating volumes to first order.
 Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.3e-04 (relative), doubling it by
 3.2e-04, and finer cells by 9.2e-02.
 """

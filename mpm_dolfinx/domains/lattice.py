@@ -9,12 +9,12 @@ The filter damps them when the grid is reset.  For each axis a in turn,
 
 The result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
 positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different
-widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), with the
-number c of cells that the corners have crossed since the last grid reset; bodies that hardly move are not filtered.
-Quadratic fields remain unchanged, also at the surface.  A wave of two domains along the axis is reduced by the fraction
-s, a wave of eight domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded
-soil is not filtered either: its deformation is irreversible, and its kinks are physical.  The filter does not move
-corners held by a wall, a prescribed displacement, a plate or another body.
+widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), if the
+corners have crossed c cells since the last grid reset.  Bodies that hardly move are not filtered.  Quadratic fields
+remain unchanged, also at the surface.  A wave of two domains along the axis is reduced by the fraction s, a wave of
+eight domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not
+filtered either: its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by
+a wall, a prescribed displacement, a plate or another body.
 """
 
 from __future__ import annotations
@@ -245,7 +245,7 @@ def lattices(
 def given(
     grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
 ) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners a condition prescribes, or `walls` (name -> components) fix."""
+    """Return which components (n, 2^d, d) of corners a condition or a wall prescribes; walls: name -> components."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)

@@ -39,7 +39,7 @@ SMALL = (0.5 / EDGES) ** 2
 Source: definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell.
 """
 COVERED = 0.25
-"""Largest |area of pieces - filled area| of a cell, divided by the cell's area.  Source: definition, one domain."""
+"""Largest difference (area of pieces) - (filled area) in a cell / cell area.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])

@@ -32,7 +32,7 @@ class Borders:
     contents
         Material in the cells.
     cells, soils, law
-        Arrays over the m pieces: cell (m,); constants (m, k), equal in equal soil; index of the retention curve (m,).
+        Arrays over the m pieces: cell (m,); constants of the soil (m, k); index of the retention curve (m,).
     facets
         Facets of this process between two active cells.
     mixed

@@ -2,12 +2,12 @@
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
 The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
-T = A kappa / d, d is the distance from the centroid of the cell's material to the face, and r is the fluid's density
-divided by that at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set method
-(Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the others, at the start of the substep and
-after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at the pressure of the pond.
-Evaporation is at most the outflow at the driest pressure.  A pond of volume V supplies V / dt in a step in addition to
-the rain, uniformly over its side.  Infiltration, ponding and run-off add up to the rain within rounding.
+T = A kappa / d, with the distance d from the centroid of the cell's material to the face.  r is the density of the
+fluid divided by the density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set
+method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the others: at the start of the substep
+and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at the pressure of the
+pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V supplies V / dt in a step in
+addition to the rain, uniformly over its side.  Infiltration, ponding and run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ THICK = np.sqrt(2)
 """(Area of the largest plane section of a cube) / (area of a face).  Source: exact bound (Ball 1986).
 
 Let a convex body of volume V in a cell lie on one side of a plane.  The distance from its centroid to the plane is at
-least V / ((d + 1) THICK h^(d-1)).  A face that is closer to the centroid of the cell's material, or behind the
-centroid, bounds only a part of the material, and must not drain the whole cell.
+least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it, bounds only a
+part of the material.  Such a face must not drain the whole cell.
 """
 
 
@@ -93,7 +93,7 @@ class DrainedSides(Feeding):
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points whose domains have faces on open sides."""
+        """Return the indices of points whose domains have faces on open sides; indices may be repeated."""
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
 
     def placed(self, wet: Wet) -> SideFeeds:
@@ -211,7 +211,7 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """Faces on open sides; at least one of the faces has rain.
 
-    With rain, the outflow is minus the rain, but at least the outflow at the pond's pressure and at most the outflow at
+    With rain, the outflow is minus the rain, within two limits: the outflow at the pond's pressure, and the outflow at
     the driest pressure.  This outflow includes seepage, so `seeps` is False at faces with rain.
     """
 

@@ -22,7 +22,7 @@ next steps correct fractions of it (`defect`), at a constant rate over the step.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term max(0, tau d - dt kappa / d) A [p - p_n], with d = d+ + d-, and the weight dt, s, of the rate at p in the step.
+term max(0, tau d - dt kappa / d) A [p - p_n].  Here d = d+ + d-, and dt, s, is the weight of the rate at p in the step.
 This raises the coefficient dt kappa A / d of a face to tau d A if the coefficient is smaller.  The stabilisation is
 conservative, and vanishes in steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value
 (Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau
@@ -278,7 +278,7 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change of the residual by displacements u, m^d: of content and, with `slopes`, of fluxes."""
+        """Set `out` to the residual's change, m^d, by displacements u: of the content and, with `slopes`, of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -355,7 +355,7 @@ class StorageProblem:
     feeds
         Sources and open sides.
     flow
-        Function that assembles the outflow at (u, p).  The argument tells whether a substep starts.
+        Function that assembles the outflow at (u, p); its argument tells whether a substep starts.
     dt
         Weight of the rate at (u, p), s.
     before
@@ -652,8 +652,8 @@ class StorageProblem:
             Multiple of beta, >= 0.
         share
             Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
-            pressure, beta V / 2 (at nu = 0) for a pressure that alternates along one axis, and zero for a checkerboard.
-            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
+            pressure, and zero for a checkerboard.  For a pressure that alternates along one axis, it is beta V / 2 (at
+            nu = 0). beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

@@ -53,7 +53,7 @@ class PointMeasure(ufl.Measure):
 
 
 class FormPoints:
-    """The points in forms: UFL coefficients, whose values are given by a `PointData`.
+    """The points in forms, as UFL coefficients; a `PointData` has the values of these coefficients.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class FormPoints:
         if name in functions:
             own = self.grid.dim == 2 and name in ("F", "dF") and functions[name].ufl_shape == (3, 3)
             return block(functions[name]) if own else functions[name]
-        raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
+        raise AttributeError(f"the points have {', '.join(functions)}, not {name!r}")
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
         """Return points in owned cells (n,), at x (n, d), m, with weight (n,), m^d, and fields; see `PointData`."""

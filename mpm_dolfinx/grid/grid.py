@@ -211,9 +211,9 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the tool, and the cells around them widen or narrow.  A function of time t (s) and positions x (n, d) of all
-        points (parameters t, x or both) returns the same number of lines, between the same sides.  A tool must be a
-        condition of the first stage; lines do not move in stages without the tool.
+        the tool, and the cells around them widen or narrow.  A function of time t (s), of the positions x (n, d) of all
+        points, or of both returns the same number of lines between the same sides.  A tool must be a condition of the
+        first stage; lines do not move in stages without the tool.
     axisymmetric
         Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
         forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
@@ -222,13 +222,13 @@ class Grid:
     Raises
     ------
     ValueError
-        Corners or lines are not finite or not ascending; numbers of cells are not integers >= 1; there are too many
-        nodes for PETSc; an axisymmetric grid is in 3D or has r < 0; `follow` is given without lines.
+        Corners or lines are not finite or not ascending.  Numbers of cells are not integers >= 1.  There are too many
+        nodes for PETSc.  An axisymmetric grid is in 3D or has r < 0.  `follow` is given without lines.
 
     Attributes
     ----------
     dim, shape, lower, upper
-        d; number of cells along each axis (d,); corners (d,), m.
+        Dimension d; number of cells along each axis (d,); corners (d,), m.
     even, lines, widths
         Whether all cells are equal; current lines (n,) along each axis, relative to `base`, m; edge lengths (n - 1,)
         along each axis, m.
@@ -368,7 +368,7 @@ class Grid:
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return index of the cell + fraction of the cell (..., d) for positions x (..., d), m, from the base."""
+        """Return cell index + fraction of the cell along each axis (..., d), for x (..., d), m, from the base."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)

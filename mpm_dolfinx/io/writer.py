@@ -194,7 +194,7 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write the parts of the grid cells inside the tools, with number and force of each tool."""
+    """Write the parts of the grid cells inside the tools, with index and force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
     corners = [
         tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
@@ -206,7 +206,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """An exclusive lock of a folder.  It ends when the last writer of this process releases it."""
+    """An exclusive lock of a folder.  The lock ends when the last writer of this process releases it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 

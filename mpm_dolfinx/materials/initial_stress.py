@@ -44,7 +44,7 @@ class K0:
     ratio
         K0, >= 0: a number, or a function of the reference positions X (n, d), m.
     surcharge : number or callable x (n, d) -> (n,), Pa
-        Pressure on the ground surface, >= 0, at positions x on the surface, for example the weight of standing water.
+        Pressure, >= 0, at positions x on the ground surface, for example the weight of standing water.
     """
 
     ratio: Field

@@ -108,7 +108,7 @@ class LocalUnknowns:
     def update(self, data: PointData, derive: bool = True) -> None:
         """Solve for the local unknowns of the points at their present F; all processes must call it.
 
-        derive: also differentiate by the trial values, as expressions in `values` need; those in `known` do not.
+        derive: also differentiate by the trial values.  Expressions in `values` need this; `known` does not.
 
         Raises
         ------

@@ -25,7 +25,7 @@ Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...)."""
 
 BY_SCENE = ("dt", "cell_size")
-"""Arguments of laws from the scene: time since the start of the step, s, and mean length of a cell, m."""
+"""Arguments that laws receive from the scene: time since the start of the step, s; mean edge length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
 """States that the scene sets: the suction max(-p, 0), Pa, at the end of a substep, and at seeding."""
@@ -84,8 +84,8 @@ class Skeleton:
     The history variables are the law's `state`, name -> initial value.  `update` (F, ...) -> {name: UFL} computes them
     at the points after every converged step.  If a new value is not finite, the time step is reduced.
 
-    A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  They are
-    arguments of `kirchhoff` and `update`.  Unknowns and their equations should be of order one:
+    A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  Unknowns
+    are arguments of `kirchhoff` and `update`.  Unknowns and their equations should be of order one:
 
     residual
         Function of the law's fields, state, unknowns and `trial`.  It returns a dict: name of the unknown -> UFL of the
@@ -93,9 +93,9 @@ class Skeleton:
     solution
         Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
         returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
-        name of the trial value.  It suits return mappings with many cases, and existing codes.  Usual unknowns are the
-        stress and the new state.  A derivative may be a function without arguments, called when a tangent is assembled.
-        A missing derivative is zero.  Without a solution, values are NaN or infinite, and the time step is reduced.  If
+        name of the trial value.  This suits return mappings with many cases, and existing codes.  Usual unknowns are
+        stress and new state.  A derivative may be a function without arguments, called when a tangent is assembled.  A
+        missing derivative is zero.  Without a solution, values are NaN or infinite, and the time step is reduced.  If
         `energy` is not stationary in the unknowns, second derivatives are missing: Newton's method is slow.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
@@ -106,7 +106,7 @@ class Skeleton:
     `cell_size`, the mean edge length of a cell, m, can make softening independent of the grid.
 
     A law that depends on suction has the state `suction`: 0.0, and optionally `suction_at_start`: 0.0.  The scene sets
-    max(-p, 0), Pa: the first at the end of a substep, the second at seeding.  With unknowns, use it in `trial`.
+    max(-p, 0), Pa: the first at the end of a substep, the second at seeding.  Laws with unknowns use it in `trial`.
 
     For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 

@@ -8,7 +8,7 @@ strain gamma and the cell size h (crack band: Bazant and Oh 1983; Pietruszczak a
     c = c_0 - (c_0 - c_r) min(1, gamma h / s),
 
 so that softening along a band dissipates (c_0 - c_r) s / 2 per area, on any grid.  The viscosity is Perzyna's, f = eta
-dgamma/dt, with the yield function f.  It is linear and integrated implicitly, and has no effect in slow loading.
+dgamma/dt, with the yield function f.  This law is linear and integrated implicitly, and has no effect in slow loading.
 """
 
 from __future__ import annotations
