@@ -26,11 +26,11 @@ from mpm_dolfinx.points.cutting import corner_bits
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return two fields (2, m, d), m: the Q1 displacement of the corners, and its quadratic correction.
+    """Return two fields (2, n, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     Parameters
     ----------
-    cells, x : (m,), (m, d), m
+    cells, x : (n,), (n, d), m
         Owned cells that contain the corners, and positions of the corners.
     u : (nodes, d), m
         Nodal displacements.

@@ -115,9 +115,9 @@ class Lattice:
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the change (m, 2^d, d), m, by which the filter corrects displacements of domain corners.
+        """Return the change (n, 2^d, d), m, by which the filter corrects displacements of domain corners.
 
-        `d` (m, 2^d, d), m, are the displacements; `crossed` (m, 2^d) the numbers of cells crossed since the grid reset.
+        `d` (n, 2^d, d), m, are the displacements; `crossed` (n, 2^d) the numbers of cells crossed since the grid reset.
         """
         if self._count is None:
             return np.zeros_like(d)

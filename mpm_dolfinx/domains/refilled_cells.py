@@ -58,13 +58,13 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class OuterFaces:
-    """Faces of domains on the surface of the bodies; arrays over m faces."""
+    """Faces of domains on the surface of the bodies; arrays over n faces."""
 
-    point: NDArray[np.int64]  # material point (m,)
-    face: NDArray[np.int64]  # index of the face in its domain (m,)
-    key: NDArray[np.int64]  # key of the seeded face (m,), see `renewed_faces`
-    area: NDArray[np.float64]  # seeded length (m,), m
-    ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (m, 2, 2), m
+    point: NDArray[np.int64]  # material point (n,)
+    face: NDArray[np.int64]  # index of the face in its domain (n,)
+    key: NDArray[np.int64]  # key of the seeded face (n,), see `renewed_faces`
+    area: NDArray[np.float64]  # seeded length (n,), m
+    ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (n, 2, 2), m
 
 
 class New(NamedTuple):
@@ -279,7 +279,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys (m,) of edges in cells (m,), and the reference positions (m, 2, 2), m, of the edges' ends.
+        """Return the keys (n,) of edges in cells (n,), and the reference positions (n, 2, 2), m, of the edges' ends.
 
         The key is that of the surface part nearest to the middle of the edge.  Reference positions of the ends come
         from the parts nearest to the ends.
@@ -302,7 +302,7 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2), m, at coordinates t (m,) on faces, from 0 (start) to 1 (end)."""
+        """Return the reference positions (n, 2), m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
         face = self.faces.face[row]
         flipped = START[face] != FACES[2][face, 0]
         share = np.where(flipped, 1 - t, t)[:, None]

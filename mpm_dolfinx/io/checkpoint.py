@@ -347,7 +347,7 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
     if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
         raise ValueError(f"{name}: not nodal values on the grid, or not finite")
     if len(node) and not 0 <= node[0] <= node[-1] < grid.copies * grid.nodes:
-        raise ValueError(f"{name}: node numbers out of range of the grid")
+        raise ValueError(f"{name}: node indices out of range of the grid")
     arrays |= {"node": node, "values": values}
 
 

@@ -62,7 +62,7 @@ class _FollowsByPlace:
     follows: ClassVar[bool] = True
 
     def __call__(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the bulk moduli (m,), Pa, at reference positions X (m, d), m."""
+        """Return the bulk moduli (n,), Pa, at reference positions X (n, d), m."""
         at = [f(X) if callable(f) else np.asarray(f) for f in (self.stress, self.kappa)]
         return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
 

@@ -107,7 +107,7 @@ class Hydrostatic(OfWater):
     given: float | None = None
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at positions x (m, d), m."""
+        """Return the pressures (n,), Pa, at positions x (n, d), m."""
         return self.unit_weight * (self.level - x[:, -1])
 
 
