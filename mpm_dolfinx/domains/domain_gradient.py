@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of particle domains, and volume ratios of cells, computed from corner positions for any path."""
+"""Deformation gradients of particle domains and volume ratios of cells, computed from corner positions for any path."""
 
 from __future__ import annotations
 
