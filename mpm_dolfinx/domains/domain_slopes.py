@@ -8,9 +8,9 @@ piece of the domain the gradient is
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume),
 
 with the local coordinates xi of the domain, in units of its edge lengths.  The slopes D_a are a least-squares fit to
-the gradients F of the neighbours across faces that have the same material.  e is then corrected so that int dV / det F,
-summed over the pieces, is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and
-uniform fields stay uniform.
+the gradients F of neighbours of the same material across faces.  e is then corrected so that int dV / det F, summed
+over the pieces, is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform
+fields stay uniform.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return bounds (n,), (n,), in [0, 1] along edges (n, 2, 2), m, of their parts inside a region (2, 2), m."""
+    """Return where edges (n, 2, 2), m, enter and leave a region (2, 2), m: two fractions (n,) of their lengths."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     edge_vector = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(edge_vector).max(axis=1)

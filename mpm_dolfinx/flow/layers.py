@@ -96,7 +96,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return, for each axis, lines through pieces `rows`, crossed pieces, and weights (below 1 on borders).
+        """Return for each axis: lines through pieces `rows`, the piece that each crosses, and a weight, < 1 on borders.
 
         `first` and `count` (m,) are the index of the first piece and the number of pieces in the cell of each piece.
         """

@@ -133,7 +133,7 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the pressure gradients minus the unit weight of the fluid (rows, d), Pa/m.
+        """Return the gradients (rows, d), Pa/m: pressure gradient minus unit weight of the fluid.
 
         Parameters
         ----------

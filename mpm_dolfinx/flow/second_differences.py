@@ -37,8 +37,8 @@ def second_differences(
     grid
         Background grid.
     strength : (n, d), m^d/Pa
-        For each owned active cell and axis: the coefficient, >= 0, of a damping of jumps that would damp alternating
-        pressures as much.
+        For each owned active cell and axis: the coefficient, >= 0, of a damping of jumps with the same effect on
+        alternating pressures.
     centroid : (c, d), m
         Centroids of the material in the local cells, relative to the midpoints of the cells.
     opening : (c, d, 2)

@@ -6,7 +6,7 @@ unknowns of each face.  Newton's method finds them from the continuity of the fl
 conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
 therefore exact at any offset from the grid.
 
-The lines through a cell (see `layers`) that cross a single soil up to the face conduct in parallel.  All lines that
+Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
 cross several soils are replaced by one line.  Its soils follow in the order along the lines, each with its mean
 fraction of the length.
 """

@@ -99,7 +99,7 @@ class StorageForms:
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
         Whether to use alpha as the derivative of the content by J_Delta, so that the Jacobian is symmetric.  The
-        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
+        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast as with it.
     feeding
         Sources and open sides of all stages.
     inertial : (d,), N/m^3

@@ -127,7 +127,7 @@ class ElementMatrices:
 
     Inserting a matrix for every point costs twice as much as computing it.  The entries of the element matrix are A
     contracted with the gradients of the shape functions at the point.  Through DG0 test functions, the assembler sums
-    these entries over the points of a cell.  Each cell is then inserted once.
+    these entries over the points of a cell.  Each element matrix is then inserted once.
 
     Parameters
     ----------

@@ -85,7 +85,7 @@ class Skeleton:
     at the points after every converged step.  If a new value is not finite, the time step is reduced.
 
     A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  Unknowns
-    are arguments of `kirchhoff` and `update`.  Unknowns and their equations should be of order one:
+    are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to values of about one:
 
     residual
         Function of the law's fields, state, unknowns and `trial`.  It returns a dict: name of the unknown -> UFL of the
