@@ -30,7 +30,7 @@ class Report:
     change: NDArray[np.float64] = field(default_factory=_none)  # largest pressure changes of bodies in the step, Pa
     extremes: NDArray[np.float64] | None = None  # minima and maxima, at start and end of the step (2, 2, bodies), Pa
     sealed: float = 0.0  # largest pressure change, Pa, in the same step without flow
-    first: NDArray[np.float64] = field(default_factory=_none)  # the same in the first substep, Pa
+    first: NDArray[np.float64] = field(default_factory=_none)  # in the first substep; 0 for bodies that keep pieces
     sudden: NDArray[np.float64] = field(default_factory=_none)  # `first`; 0 if pressures change on in the second
     stress: float = 0.0  # root mean square of the nodal forces, divided by the area of a cell face, Pa
     moves: tuple[float, float] = (0.0, 0.0)  # estimated error and size of the motion, see `motion_error`

@@ -20,7 +20,6 @@ from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
-from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.step_memory import StepControl
 

@@ -428,6 +428,14 @@ class Motion:
         inside[self._body(points), on_grid.parts[0]] = True
         return largest_of_bodies(self._momentum.grid.comm, part[cells] - 1, values, inside)
 
+    def resets(self, state: State) -> NDArray[np.bool_]:
+        """Return which bodies (bodies,) have points that do not keep their pieces."""
+        count, stay = len(self._bodies), state.stay
+        if state.stays:
+            return np.zeros(count, dtype=bool)
+        body = self._body(state.points) if stay is None else self._body(state.points)[~stay.keeps]
+        return over_all(self._momentum.grid.comm, np.bincount(body, minlength=count)) > 0
+
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the index of each point's body (n,)."""
         return body_of(points.id, self._starts)

@@ -74,6 +74,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     end = state.t + dt, [one.ended(at) for one in acting.loads], both.net_inflow(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
     velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
+    report.first = report.first * scene.motion.resets(new)
     now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
         kinetic = state.stage.kinetic(outcome)

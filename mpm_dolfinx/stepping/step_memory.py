@@ -22,7 +22,7 @@ class StepControl:
     change : (bodies,), Pa
         Largest pressure change of each body since the start of the run.
     first : (bodies,), Pa/s
-        Value `first` of the last step in `Report`, divided by the length of the step; 0 if all points keep their cut.
+        Value `first` of the last step in `Report`, divided by the length of the step.
     start : (2, bodies), Pa
         Smallest and largest cell pressures of each body at the start of the run; None before the first step.
     motion : J^(1/2)
