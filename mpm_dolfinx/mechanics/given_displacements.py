@@ -26,12 +26,11 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
-from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
@@ -87,8 +86,8 @@ class GivenDisplacements(Acting):
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
             if common := sorted(set(axes) & set(more)):
-                check_apart(one, faces, other, others)
-                self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
+                faces.check_apart(others, (one, other))
+                self._meeting.append((one, other, common, sides.meeting(faces, others)))
         self._holds = self.held = held_faces(setting)
         for hold in displacements.values():
             if not callable(hold.value):  # values of functions are checked when they are called
@@ -175,12 +174,12 @@ class GivenDisplacements(Acting):
             values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
             rows.append((p.cell, p.x, values))
             bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
-        cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
+        cell, x, values = self._grid.gathered(rows, 6 + 5 * d)
         extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
         sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
         inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
         if over_all(self._grid.comm, int((inner != cell).any())):
-            cell, x, values = gathered(self._grid, [(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
+            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
         number, *own = values[:, :6].T
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
@@ -194,7 +193,7 @@ class GivenDisplacements(Acting):
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
-        return everywhere(self._grid, lambda: hold.at(t, X))
+        return everywhere(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return reactions, by quantity and name of the condition, with every component equal to `value`."""
