@@ -28,7 +28,6 @@ from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
-from mpm_dolfinx.mechanics.given_displacements import held_faces
 from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
@@ -77,7 +76,7 @@ class Tools(Touching):
     def __init__(self, setting: Setting, tools: Mapping[str, Tool]):
         super().__init__(setting, tools)
         grid, self.tools = setting.grid, tuple(tools.values())
-        self._held = [(hold, faces) for hold, faces, _ in held_faces(setting)]
+        self._held = [(hold, faces) for hold, faces, _ in setting.held]
         """Prescribed displacements with their faces.  Tools must not touch these faces."""
         still = np.zeros(len(self.tools))
         self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None

@@ -35,6 +35,8 @@ from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
+ARTEFACT = "%s: not at its prescribed position at %s: %s"
+
 
 class HoldForms:
     """Forms of the penalty at points or for their means: stiffness, and force towards the prescribed displacement."""
@@ -80,15 +82,14 @@ class GivenDisplacements(Acting):
         self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
-        self._warned: set[int] = set()  # indices of the conditions with a warning in the log
-        self._jumped: set[int] = set()  # likewise, for jumps at the start
+        self._warned: set[tuple[int, str]] = set()  # indices of the conditions with a warning in the log, and its text
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
             if common := sorted(set(axes) & set(more)):
                 faces.check_apart(others, (one, other))
                 self._meeting.append((one, other, common, sides.meeting(faces, others)))
-        self._holds = self.held = held_faces(setting)
+        self._holds = self.held = setting.held
         for hold in displacements.values():
             if not callable(hold.value):  # values of functions are checked when they are called
                 hold.at(0.0, np.empty((1, d)))
@@ -113,11 +114,10 @@ class GivenDisplacements(Acting):
             strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
             sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
             jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
-            if jump and number not in self._jumped:
+            if jump:
                 what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: it %s"
                 why = "counts from the start or the last reset_displacement, must begin at the present position"
-                warn(self._grid.comm, ConditionWarning, what, line(hold), jump, place.start, why)
-                self._jumped.add(number)
+                self._warn(number, what, jump, place.start, why)
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep: one for each component and each cell or point."""
@@ -204,20 +204,19 @@ class GivenDisplacements(Acting):
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
-        self._warn(held, loads.row, data["direction"].argmax(axis=1), force)
+        told = {number for number, what in self._warned if what == ARTEFACT}
+        for number, x in held.beyond(loads.row, data["direction"].argmax(axis=1), force, told):
+            why = "its reaction is an artefact; is it also held by another condition, or is the step too large?"
+            self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
         sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
-    def _warn(
-        self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
-    ) -> None:
-        """Warn, once for each condition, if a reaction exceeds any stress increment that the body can bear."""
-        for number, x in held.beyond(row, axis, force, self._warned):
-            why = "its reaction is an artefact; is it also held by another condition, or is the step too large?"
-            what = "%s: not at its prescribed position at %s: %s"
-            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), x + self._grid.base, why)
-            self._warned.add(number)
+    def _warn(self, number: int, what: str, *values) -> None:
+        """Warn, once for each condition, of what is wrong with the condition with this index."""
+        if (number, what) not in self._warned:
+            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
+            self._warned.add((number, what))
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise NotConverged if all points of a side follow less than half of their prescribed increment."""
@@ -393,10 +392,3 @@ class HoldLoads(Loads):
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions."""
         return {"reactions": self._acting.reactions(self, at)}
-
-
-def held_faces(setting: Setting) -> list[tuple[Displacement, Surface, Sequence[int]]]:
-    """Return the conditions of a stage with the faces and the axes on which they are imposed."""
-    holds = [(hold, hold.axes(setting.grid.dim)) for hold in setting.of(Displacement).values()]
-    others = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
-    return [(hold, setting.sides.held(hold, rest), axes) for (hold, axes), rest in zip(holds, others, strict=True)]
