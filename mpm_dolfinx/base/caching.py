@@ -46,7 +46,9 @@ class Latest(Generic[T]):
         """
         other = self._entry is None or not same(self._entry[0], key)
         if other if comm.size == 1 else over_all(comm, other) > 0:
-            self.clear()
+            self._entry = None
+            for one in self._derived:
+                one.clear()
             self._entry = key, make()
         return self._entry[1]
 
