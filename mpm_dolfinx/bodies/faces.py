@@ -42,8 +42,8 @@ class Surface:
     each polygon has a row.
     """
 
-    id: NDArray[np.int64]  # number of the material point (m,), ascending
-    face: NDArray[np.int64]  # number of the face in its domain (m,), see `cutting.FACES`
+    id: NDArray[np.int64]  # identifier of the material point (m,), ascending
+    face: NDArray[np.int64]  # index of the face in its domain (m,), see `cutting.FACES`
     # corners of the free part in local coordinates of the domain in [-1, 1] (m, 2^(d-1), d); triangles repeat the last
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
@@ -195,7 +195,7 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # a sliver in the region would prescribe a domain
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # so that no sliver in the region prescribes a face
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)
@@ -210,9 +210,9 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Limit parts of faces to a region; return the face (m,) of each limited part, and its corners xi as in `Surface`.
+    """Limit parts of faces to a region; return for each limited part its face (m,), and corners xi as in `Surface`.
 
-    `row` and `face` (k,) are domains and face numbers.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
+    `row` and `face` (k,) are domains and face indices.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
@@ -263,7 +263,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region; return triangles, and the index of the part of each."""
+    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region; return triangles, and for each the index of its part."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, a corner serves as the middle
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -279,7 +279,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces: the face (n,) of each part, and its corners (n, 4, 2) in face coordinates [0, 1].
+    """Return the free parts of faces: for each part its face (n,) and corners (n, 4, 2) in face coordinates [0, 1].
 
     A part is a rectangle if all boxes that cover its face lie along the edges of the face.  Otherwise it is a triangle
     with a repeated last corner.
@@ -308,7 +308,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return local coordinates xi (n, 3) in domains (n, 8, 3), moved along faces (n,) to match positions x (n, 3)."""
+    """Return local coordinates xi (n, 3), with the tangential parts of positions x (n, 3) projected onto faces (n,)."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

@@ -45,7 +45,7 @@ class Sides:
         copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
-            raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
+            raise ValueError(f"{what}, must be one; limit each condition to one group by a region")
         return found
 
     def _of(self, side: str, region: Region | None) -> Surface:

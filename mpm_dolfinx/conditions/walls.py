@@ -17,7 +17,7 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 
 
 def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the fixed components of each wall, with the radial component on the axis."""
+    """Return the fixed components of each wall; the wall on the axis also fixes the radial component."""
     left = walls.get("left", "") if isinstance(walls, Mapping) else None
     if not grid.has_axis or not isinstance(left, str) or "x" in left:
         return walls
@@ -66,9 +66,8 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), N, of each wall by name; all processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of them is
-    normal to it, they share the force evenly.
-    The axis of revolution has no area, so its radial force is zero.
+    If several walls fix a component of a node, the wall normal to this component carries the force, or all of them
+    carry it evenly if none is normal.  The axis of revolution has no area, so its radial force is zero.
 
     Parameters
     ----------

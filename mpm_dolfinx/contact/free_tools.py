@@ -61,10 +61,10 @@ class FreeTools(ContactProblem):
     placed
         Arguments of `ToolLoads`.
     mass, guides
-        Masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  Projections (k, q, q) on
-        the motions that each tool can perform, see `motion_count`.
+        `mass`: masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  `guides`:
+        projections (k, q, q) on the motions that each tool can perform, see `motion_count`.
     velocity, pushes
-        Velocities (k, q), m/s and rad/s, at the start of the step.  Loads (k, q), N and N m.
+        `velocity`: velocities (k, q), m/s and rad/s, at the start of the step.  `pushes`: loads (k, q), N and N m.
     """
 
     couples = True

@@ -5,11 +5,11 @@ A pair consists of a quadrature point on a surface and the opposite position, on
 With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
 at the start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This
-is repeated until the gaps match the faces at the end of the step.
+is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
-the equilibrium of the bodies, by
+the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
+together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
@@ -375,9 +375,9 @@ class ContactProblem(Loads):
         _, touches = self._seek(found)
         failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(failed)[:1]:
-            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain it?"
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain the tool?"
             if reaction[k] == 0:
-                why = "there is no contact within a cell: does it begin at the surface of a body?"
+                why = "there is no contact within a cell: does the tool start at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
         linear = self.now.linear
         motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
@@ -396,9 +396,9 @@ class ContactProblem(Loads):
         return True
 
     def _continued(self, new: Current, at: At) -> tuple[Current, float]:
-        """Return the contact with pairs found at u, and the largest change of a gap from the current pairs, cells.
+        """Return the contact with pairs found at u, and the largest change of a gap by this update / cell size.
 
-        Pairs that are open before and after are ignored.
+        Pairs that are open before and after the update are ignored.
         """
         found = self.found(at)
         law = self.now.law
@@ -429,9 +429,9 @@ class ContactProblem(Loads):
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do work.  Elastic slip in stick counts as dissipation, and is returned on unloading.
+        """See `Loads`.  Only tools do external work.  Elastic slip counts as dissipation, negative on unloading.
 
-        Contact pressures are taken to do no work, because velocities of substeps jump where a gap closes in a step.
+        Contact pressures are taken to dissipate nothing: velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)
@@ -440,7 +440,7 @@ class ContactProblem(Loads):
         moves = relative.array_r.reshape(-1, self.grid.dim)
         tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
         shear = law.pairs.area[:, None] * found.touch.shear[law.of]
-        # `push` has counted the power of the tools as a part of the nodes' power
+        # the power of the forces in `push` at the nodes is replaced by the power of the tools
         more = -float((found.balanced * moves).sum()) + float((found.touch.force * tool).sum())
         return -float((shear * (moves - tool)).sum()), more
 

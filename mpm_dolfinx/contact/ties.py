@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-A penalty resists the difference of the displacements at equal heights: k/2 int |u_one - u_other|^2 dA.  Displacements
+A penalty resists the difference of the displacements at equal heights: k/2 int (u_one - u_other)^2 dA.  Displacements
 are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and opposite.
 """
 
@@ -31,8 +31,8 @@ from mpm_dolfinx.grid.grid import Grid
 class Tie:
     """Two opposite tied sides, and the faces at equal heights.
 
-    `partner` (m,) is the face of the other side for each face of one side.  `offset` (m, d), m, is the vector between
-    both faces.  `axis` is the axis normal to them.
+    For each face of one side, `partner` (m,) is the index of the opposite face, and `offset` (m, d), m, is the vector
+    to this face.  `axis` is the axis normal to the sides.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
@@ -112,7 +112,7 @@ class TieLoads(Loads):
     cell, x : (m,), (m, d), m
         Local cells, and positions in them, on one side.
     other, y : (m,), (m, d), m
-        Lexicographic numbers of cells of any process, and positions in them, on the other side.
+        Lexicographic cells of any process, and positions in them, on the other side.
     stiffness : (m,), N/m
         Penalty stiffness.
     gap : (m, d), m

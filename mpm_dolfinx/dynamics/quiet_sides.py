@@ -31,7 +31,7 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Points on quiet sides: impedances across the normal and their excess along it, kg/m^2/s, and constant forces."""
+    """Points on quiet sides: impedance across the normal, its excess along the normal, kg/m^2/s, constant traction."""
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.points = p = FormPoints(grid, normal=(grid.dim,), across=(), along=(), force=(grid.dim,))
