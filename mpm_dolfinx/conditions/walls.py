@@ -52,7 +52,7 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, clipped to the walls, and to the grid if they were in it `before` a correction."""
+    """Return corners (n, 2^d, d), m, clipped to fixed walls; and to other sides, if they were inside `before`."""
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
