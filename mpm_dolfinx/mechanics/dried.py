@@ -59,7 +59,7 @@ class OfSuction:
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return for each part its cells (c,), and derivatives (c, n), m^(d-1), of nodal forces by their pressures."""
+        """Return pairs of cells (c,), and derivatives (c, n), m^(d-1), of nodal forces by these cells' pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

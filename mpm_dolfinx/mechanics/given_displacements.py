@@ -39,7 +39,7 @@ ARTEFACT = "%s: not at its prescribed position at %s: %s"
 
 
 class HoldForms:
-    """Forms of the penalty at points or for their means: stiffness, and force towards the prescribed displacement."""
+    """Forms of penalties, at points or on means over points: stiffness, and force towards the prescribed position."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -100,9 +100,9 @@ class GivenDisplacements(Acting):
         return [faces for _, faces, _ in self._holds]
 
     def check_start(self, place: Place) -> None:
-        """Warn, once for each condition, if it moves its side at once as bodies with inertia begin to move.
+        """Warn, once for each condition, if its side must jump at the start of a stage with inertia.
 
-        The motion in a single step strains the cell at the side more than the stress there.
+        A gap is a jump if it strains the cell at the side by more than (stress there) / (modulus there).
         """
         if not (place.inertia and place.dt):
             return
@@ -115,8 +115,8 @@ class GivenDisplacements(Acting):
             sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
             jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
             if jump:
-                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: it %s"
-                why = "counts from the start or the last reset_displacement, must begin at the present position"
+                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: %s"
+                why = "values count from the start or the last reset_displacement, must begin at the present position"
                 self._warn(number, what, jump, place.start, why)
 
     def placed(self, place: Place) -> Loads:
@@ -144,9 +144,9 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, on the processes that own the cells whose constraints contain them.
+        """Return the integration points on sides, each on the process that owns the cell with the point's constraint.
 
-        ends: start and end of the step, s, empty for zero displacement.
+        ends: start and end of the step, s; empty if the displacement is zero.
         """
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
@@ -206,7 +206,7 @@ class GivenDisplacements(Acting):
         force = loads.pull(at.nodal)
         told = {number for number, what in self._warned if what == ARTEFACT}
         for number, x in held.beyond(loads.row, data["direction"].argmax(axis=1), force, told):
-            why = "its reaction is an artefact; is it also held by another condition, or is the step too large?"
+            why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
             self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
         sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
@@ -294,14 +294,14 @@ class HoldLoads(Loads):
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
-        self._asked = data["gap"][:, 0]  # of means: their gaps contain nothing else at first
+        self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
         self._lacked = np.full(len(acting.held) * self._d, np.inf)
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces of cell means to their multipliers, on sides that lag behind their displacement.
+        """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
 
         A body such as one of sealed water resists the side's motion more stiffly than a single cell would.  The updates
-        end if the mean gap no longer falls by half: the cells cannot follow the side any further.
+        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.
         """
         if not self._place.dt:
             return False
@@ -323,7 +323,7 @@ class HoldLoads(Loads):
         self._forms.pull.assemble_vector(b, self.data)
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the penalty stiffness; `counted` returns its forces on walls of the grid."""
+        """Add the penalty stiffness; the penalty forces on walls of the grid come from `counted`."""
         if not walls:
             self._forms.hold.assemble_matrix(A, self.data)
 
@@ -347,7 +347,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return degrees of freedom (n,), and the penalty forces (n,), N, on them for the forces of walls."""
+        """Return unrolled dofs (n,), and penalty forces (n,), N, on them that do not count as reactions of walls."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

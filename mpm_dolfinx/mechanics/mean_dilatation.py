@@ -12,10 +12,10 @@ only the materials that would lock use Fbar. The energy sum w psi(Fbar) / J_n ha
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-For given (theta, pi) the residual has the additional term with pi, and a symmetric tangent. The contribution of
-theta and pi has rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material point method:
-Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar. The next step
-starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
+At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives by
+theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material
+point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar.
+The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class FBar:
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In 2D a law without an energy is differentiated with respect to Fbar only, which takes half of the time.  With
+        In 2D a law without an energy is differentiated with respect to Fbar only: tangents take half of the time.  With
         Fbar = s F,
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
@@ -190,7 +190,7 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, the sums over all parts in each, and its volume with F-bar (cells, 1)."""
+        """Return the cells with F-bar, the sums over all parts in each cell, and the volumes (cells, 1) with F-bar."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
@@ -219,7 +219,8 @@ class MeanDilatation:
             axis=1,
         )
         d = c if self._symmetric else other[0]
-        # (d b^T + b c^T + e b b^T) V with the means b, c, d, e of the derivatives of det(Delta), dPsi/dtheta, P
+        # (d b^T + b c^T + e b b^T) V; means over the volume V of derivatives: b of det(Delta) by u, c and e of
+        # dPsi/dtheta by u and theta, d of P by theta
         columns, rows = (c + 0.5 * e * b) * volume, (d + 0.5 * e * b) * volume
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)

@@ -196,7 +196,7 @@ class MomentumForms:
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the nodal forces that the functions `adders` add, over all processes, as local array; room: buffer."""
+        """Return the nodal forces that `adders` add, summed over processes, a local array; room: index of a buffer."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -237,7 +237,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (nodes,) over the cells at each node; values of owned cells (cells,), or of their nodes."""
+        """Return the sums (nodes,) over the cells at each node; values (cells,), or (cells, 2^d) for their nodes."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
         nodes = self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
@@ -249,7 +249,7 @@ class MomentumForms:
         return values_at[nodes * d]
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
-        """Return the connected parts of the bodies in active cells; of, count: result of `OnGrid.parts_of_cells`."""
+        """Return the connected parts of the bodies; `of` and `count` are the results of `OnGrid.parts_of_cells`."""
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
         own = self.active.now.cells[self.active.now.cells < grid.num_owned]
         total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
@@ -474,7 +474,7 @@ class MomentumProblem:
         """Return the out-of-balance nodal forces at u, N, and the force scale (parts,), N, of each connected part."""
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
-        system.held.gather(b, system.held_residual)  # before the penalties, which walls bear for sides next to them
+        system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
         if pulls := [one.pulls for one in self.loads if one.stiff]:
             # not in the scale: at the start of a step they far exceed the forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
@@ -493,7 +493,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and the norms (terms, parts) of its terms, N, as a list."""
+        """Return the result of `unbalanced`, and a list: for each of its terms the norms (parts,), N."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -535,9 +535,9 @@ class MomentumProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two relative residuals of each connected part: without rounding errors, and with them.
 
-        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node,
-        unless `first` is set, so that one solve is made even for a load below the rounding error.  The second result
-        uses scales of at least the rounding error divided by the tolerance.
+        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node.
+        With `first` it includes this error, so that even a load below the error causes a solve.  The second result uses
+        scales of at least the rounding error divided by the tolerance.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

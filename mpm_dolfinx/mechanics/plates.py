@@ -100,7 +100,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep; even: loads of their uniform tractions."""
+    """Plates in a substep; even: loads of the plates' uniform tractions."""
 
     stiff = True
 
@@ -153,5 +153,5 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
         where = "slope" if apart[0] == 0 else f"and {other} are not connected at one height"
         raise ValueError(
             f"{line(plate)}: faces at {one} {where}, must be one flat side normal to an axis; "
-            "use one plate with a region for each"
+            "use one plate with a region for each side"
         )

@@ -108,7 +108,7 @@ def joined_parts(
 ) -> tuple[NDArray[np.int64], int]:
     """Return the parts of cells and their number, as `parts_of_cells`, with the parts of some pairs of cells joined.
 
-    pairs (m, 2): active lexicographic cells; each process may have some. All processes must call it.
+    pairs (m, 2): lexicographic indices of active cells; each process may have some. All processes must call it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.local(cells)], 0)
@@ -119,7 +119,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part (n,), from 0, of cells by indices and copy (n, d + 1), and the number of parts."""
+    """Return the part (n,), from 0, of each cell, and the number of parts; index (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -142,10 +142,10 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return for each cell the number of its connected part, counted over all processes, and the number of parts.
+    """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
 
-    own, count: part of each cell, and number of parts, counted on this process alone; nodes, of_node (n,): local
-    numbers of the cells' nodes, and part of each node on this process.
+    own, count: part of each cell, and number of parts, on this process alone; nodes, of_node (n,): local indices of the
+    cells' nodes, and part of each node on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

@@ -185,7 +185,7 @@ class Simulation:
     def reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain), in the last step.
 
-        In axisymmetry for the full circumference, radial forces outward; nan before the first step of a stage.
+        In axisymmetry: of the full circumference, radial component positive outward. Before a stage's first step: nan.
         """
         return self.outcome("reactions")
 

@@ -215,7 +215,7 @@ class LinearSolvers:
                     P = storage.assemble_preconditioner(self.scheme.beta, share)
                     self._solve_s.setOperators(self._schur, P)
                 factorise(self.solve_u.pc, self._solve_s.pc)
-                # a resumed run lacks factors of earlier steps: they must not be reused
+                # reused within a step only, because a resumed run lacks factors of earlier steps
                 kept.operator = not self.scheme.richardson and data is None
         if first:
             self._tell_unread()
@@ -304,7 +304,7 @@ class LinearSolvers:
         x.array_w[:] *= scale
 
     def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
-        """Limit the decrease of pressures in the direction as the retention curves require; update displacements."""
+        """Limit the pressure decreases of the direction, see `restrained`, and update the direction's displacements."""
         if not storage.forms.retains:
             return log_change
         dp, log_change = storage.restrained(self.dp.array_r, log_change)

@@ -47,7 +47,7 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay, Trend
 
 TAKES_IN = 0.1
-"""Rate of correction of the points' volume defect `owed`, per cell size of corner motion in their connected part.
+"""Rate of correction of the points' volume defect `owed`, for each cell size that corners of their connected part move.
 
 The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With
 rates of 0, 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress.
@@ -120,7 +120,7 @@ class Motion:
         stays
             Whether points that hardly move may keep their pieces.
         carried
-            Function of the points' motion (n,), in cell sizes, 0 without reset: their new velocities, `Mass.carried`.
+            Function that returns new velocities (`Mass.carried`) for the points' motion (n,) in cells, 0 if cuts stay.
 
         Raises
         ------
@@ -191,10 +191,11 @@ class Motion:
         return Trend(np.append(dt, before.lengths[:1]), np.concatenate([rates, before.rates[:, :1]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float) -> NDArray[np.float64]:
-        """Return the displacements (unknowns,), m, a local array, in the next seconds (s), from the trend of the state.
+        """Return displacements (unknowns,), m, in the next `seconds`, s, from the trend of the state, as local array.
 
-        The change of each domain is affine. A cell takes the mean of its pieces, and a node the mean of its cells, by
-        volumes. From rest, ten load steps of a drained beam take 50 Newton steps, 30 tangents; from this guess 33, 13.
+        The change of each domain is affine. A cell takes the mean of its pieces, and a node the mean of its cells, both
+        weighted by volume. In ten load steps of a drained beam, this guess instead of u = 0 reduces the Newton steps
+        from 50 to 33, and the tangents from 30 to 13.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
@@ -264,7 +265,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step, in the shape that laws use.
 
-        It is the mean of Delta F over the pieces, scaled so that its determinant is the mean of their determinants.
+        F is the mean of Delta F_n over the pieces of the point, scaled to the mean of their determinants.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -305,7 +306,7 @@ class Motion:
 
         Returns
         -------
-        The points; whether each point (n,) is still at the position at which it was cut; number of inverted domains.
+        The points; whether each point (n,) keeps its pieces, see `OnGrid.valid`; number of inverted domains.
         """
         cut = on_grid.cut
         stage = state.stage
@@ -348,7 +349,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points with corrected corners of yielded domains, except where keeps (n,) is true."""
+        """Return the points after `with_volumes` has corrected corners of yielded domains, except where keeps (n,)."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -376,9 +377,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The defect adds, to that of earlier steps, the increase of fluid content by volume and cell pressures minus the
-        net inflow, both as fluid mass / density at zero pressure, divided by alpha. Soil with a free surface has none:
-        its content excludes drained water. Points with keeps (n,) have no correction.
+        The step adds (increase of the fluid content due to volume and cell pressures - net inflow) / alpha to it, both
+        as fluid mass / density at zero pressure. Soil with a free surface has no defect, because its content excludes
+        drained water. Where keeps (n,) is true, points have no correction.
         """
         before = state.points
         cut = on_grid.cut

@@ -2,17 +2,18 @@
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
 F of yielded soil is updated by increments, so domains serve for integration only. They may be replaced if the new
-domains fill the same region, with the same surface and contents. Cells of a domain longer than a cell are filled anew:
+domains fill the same region, with the same surface and contents. Cells with a piece of a domain longer than `LONGEST`
+are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
   there becomes `EDGES` edges, with the same ends, area and sharp corners.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
-each cell. Mass-weighted sums of other point data are exact too, such as of the logarithm of the elastic left
-Cauchy-Green tensor. These data are means over the overlap of old and new domains, shifted to the new centroids by
-fitted slopes, within the range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or
-several surface crossings are unchanged.
+each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
+These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
+range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings
+are unchanged.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain in cells; a longer one should bend, but has straight edges. Source: definition."""
+"""Largest length of a domain, in cell sizes; longer ones should bend, but have straight edges. Source: definition."""
 
 
 class Renewal:
@@ -161,7 +162,8 @@ class Renewal:
     ) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, of new domains, so that their cells contain the fluid of the old domains.
 
-        group (m,): group of each new domain, see `RefilledCells`; it has one pressure, the mean by storage or volume.
+        group (m,): group of each new domain, see `RefilledCells`.  All domains of a group have one pressure: the mean
+        weighted by storage, or by volume if there is no storage.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
@@ -185,7 +187,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of all outer faces, and a number for the conditions on each; -1 if they forbid renewal."""
+        """Return the keys of outer faces, and an index of the set of conditions on each, -1 if it forbids renewal."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -238,7 +240,7 @@ class Renewal:
         volume0 = V[group] * size / A[group] / ratio
 
         def kept(values: NDArray) -> NDArray:
-            """Return means whose sum by mass is exact: the defect is distributed within the range of the values."""
+            """Return means with an exact mass-weighted sum; its defect is distributed within the values' range."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)

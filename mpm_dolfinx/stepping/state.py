@@ -45,7 +45,7 @@ class StepControl:
     change : Pa
         Largest pressure change since the start of the run.
     first : Pa/s
-        Value `sudden` of the last step in `Report`, divided by the length of the step, if the grid was reset.
+        Value `first` of the last step in `Report`, divided by the length of the step; 0 if all points keep their cut.
     motion : J^(1/2)
         Largest motion since the start of the run, see `motion_error`; None if unused.
     filled
@@ -112,7 +112,7 @@ class Trend:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
-    """All data of a scene that one step passes to the next; immutable, as a step returns a new state.
+    """All data of a scene that one step passes to the next; immutable: each step returns a new state.
 
     A checkpoint stores all of these data except two: the stage, which the script defines, and the watched points.
 
@@ -152,7 +152,7 @@ class State:
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.
     watched : (m,)
-        Numbers of points with probes in their domains, which renewal does not replace.
+        Ids of the points whose domains contain probes; renewal does not replace these domains.
     result, control
         Histories of the last run, and its step control; None before the first run.
     """
@@ -186,7 +186,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions at which the next step cuts them; at the last reset if they keep their pieces."""
+        """Points at the positions at which the next step cuts them; with kept pieces, at those of the last reset."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
