@@ -14,7 +14,7 @@ from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.simulation import simulation
 from mpm_dolfinx.simulation.step_size import StepSize
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import StepControl
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 OPEN = mpm.Drained("top")

@@ -218,7 +218,7 @@ def by_place(value) -> bool:
     return callable(value) and bool(set(PLACES) & set(takes(value) or ()))
 
 
-def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> tuple[str, ...]:
+def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[str, ...]:
     """Return the arguments of a function, among t, X and x.
 
     Raises

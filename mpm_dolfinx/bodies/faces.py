@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.tolerances import SAME, TINY
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import (
     BITS,
@@ -26,7 +27,7 @@ from mpm_dolfinx.bodies.touching import (
     weights,
     within,
 )
-from mpm_dolfinx.grid.grid import rounding
+from mpm_dolfinx.grid.grid import ranges, rounding
 from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACES, corner_bits
 
 TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(d)]) for d in (2, 3)}
@@ -104,6 +105,20 @@ class Surface:
     def X(self) -> NDArray[np.float64]:
         """Bounding boxes (m, 2, d), m, of the reference positions of the free parts."""
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
+
+    def check_apart(self, others: Surface, conditions: tuple[Any, Any]) -> None:
+        """Raise an error if two conditions that exclude each other act on the same part of a face."""
+        first, stop = (np.searchsorted(others.id, self.id, end) for end in ("left", "right"))
+        a, b = ranges(first, stop - first)  # all pairs of faces of the same domain
+        same = self.face[a] == others.face[b]
+        a, b = a[same], b[same]
+        low, high = np.maximum(self.X[a, 0], others.X[b, 0]), np.minimum(self.X[a, 1], others.X[b, 1])
+        size = self.X[a, 1] - self.X[a, 0]
+        common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # or no extent along it
+        both = np.flatnonzero(common.all(axis=1))
+        if len(both):
+            x = (low[both[0]] + high[both[0]]) / 2
+            raise ValueError(f"{' and '.join(map(line, conditions))}: both act at {x}, must not; limit them by regions")
 
 
 Region = tuple[ArrayLike, ArrayLike]

@@ -96,7 +96,7 @@ def put(
     if any(contact.moved.any() for contact in contacts):
         u = _follow(grid, body, corners, contacts)
         misfit = max(contact.misfit(u) for contact in contacts)
-        _check_shape(grid, fill, body, corners, u)
+        _check_shape(grid, fill, corners, u)
         corners = corners + u
     if misfit > MISFIT * grid.least:
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface on which it is placed"
@@ -200,7 +200,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
     return out
 
 
-def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray) -> None:
+def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
     """Raise an error if a displaced domain of the fill loses nearly all its volume, or leaves the grid."""
     now = corners + u
     ratio = volumes(now) / volumes(corners)

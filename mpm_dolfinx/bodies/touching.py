@@ -18,7 +18,7 @@ from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
+from mpm_dolfinx.points.cutting import FACE_SIGNS, FACES, corner_bits, cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
 
@@ -38,7 +38,8 @@ class Faces:
         """Return the faces of a body with domains `row` (m,) and face indices `face` (m,)."""
         domains, dim = body.corners(row), body.dim
         outward = np.pad(face_vectors(domains, face), ((0, 0), (0, 3 - dim)))
-        index = face_index(dim)[face]
+        # in plane strain each corner occurs at both ends of axis 3
+        index = FACES[dim][face] if dim == 3 else FACES[dim][face][:, BITS[:, 0]]
         corners = np.take_along_axis(domains, index[:, :, None], axis=1)
         if dim == 2:
             corners = np.concatenate([corners, np.broadcast_to(BITS[:, 1:], (len(row), 4, 1))], axis=2)
@@ -90,16 +91,7 @@ def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) ->
         n = np.array([t[:, 1], -t[:, 0]]).T
     else:
         n = 0.5 * np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1])
-    return n * _OUTWARD[dim][face].reshape(-1, 1)
-
-
-_OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
-"""Sign that turns the cross product of a face's edges outwards."""
-
-
-def face_index(dim: int) -> NDArray[np.int64]:
-    """Return corner indices (2d, 4) of a domain's faces.  In plane strain each corner occurs at both ends of axis 3."""
-    return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
+    return n * np.array(FACE_SIGNS)[face].reshape(-1, 1)
 
 
 def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:

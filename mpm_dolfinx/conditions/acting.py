@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from petsc4py import PETSc
@@ -22,6 +23,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.conditions import Displacement
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.unknowns import Unknowns
@@ -87,6 +89,13 @@ class Setting:
     def grid(self) -> Grid:
         """Background grid."""
         return self.sides.grid
+
+    @cached_property
+    def held(self) -> list[tuple[Displacement, Surface, Sequence[int]]]:
+        """Prescribed displacements of the stage, with the faces and the axes on which they are imposed."""
+        holds = [(hold, hold.axes(self.grid.dim)) for hold in self.of(Displacement).values()]
+        rest = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
+        return [(hold, self.sides.held(hold, those), axes) for (hold, axes), those in zip(holds, rest, strict=True)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
         """Return the conditions of the given classes, by name."""

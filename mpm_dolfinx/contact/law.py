@@ -255,12 +255,8 @@ class ContactLaw:
 
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
         """Return the rounding errors of the forces (m,), N, of the pairs."""
-        return self.rounding_of_gap * self.stiffness(state) * self.pairs.area
-
-    @property
-    def rounding_of_gap(self) -> NDArray[np.float64] | float:
-        """Rounding error of gaps, m: (m,) for each pair, or one value for all."""
-        return 4 * EPSILON * self.pairs.largest_coordinate
+        of_gap = 4 * EPSILON * self.pairs.largest_coordinate
+        return of_gap * self.stiffness(state) * self.pairs.area
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""

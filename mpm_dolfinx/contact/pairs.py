@@ -19,12 +19,11 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere
 
 
 class Geometry(NamedTuple):
@@ -114,7 +113,7 @@ class ToolPairs(Pairs):
                 if isinstance(solid, Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
-        everywhere(self.grid, ask)
+        everywhere(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property

@@ -174,14 +174,18 @@ class ContactProblem(Loads):
         return self.pushed or self._cell_pairs is not None
 
     @property
-    def _still(self) -> NDArray[np.float64]:
-        """Zero displacements of tools by loads: (k,), or with free tools (k, q)."""
-        return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
+    def _loaded(self) -> NDArray[np.int64]:
+        """Indices of the tools that loads move; each of them couples all nodes under it."""
+        return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
 
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
-        key = self.now, at.unknowns, at.u[at.unknowns.owned]
-        return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
+
+        def find() -> Found:
+            w = self._apart_by(self.now.law, at)
+            return self._find_at(w, self._motion(w))
+
+        return self._found((self.now, at.unknowns, at.u[at.unknowns.owned]), find, self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
         """Return the relative displacements w (m, d), m, of the pairs of a law."""
@@ -197,9 +201,6 @@ class ContactProblem(Loads):
             return B, B.createVecLeft()
 
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
-
-    def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._motion(w) if self.pushed else self._still)
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         law = self.now.law
@@ -223,7 +224,7 @@ class ContactProblem(Loads):
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
-        for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
+        for number in self._loaded:
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
             more = outer(own, own)
             out = more if out is None else out + more
@@ -274,7 +275,12 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (tools,), m, of tools by loads at w (m, d), m, from the last linearisation."""
+        """Return the displacements of tools by loads at w (m, d), m, from the last linearisation.
+
+        Shape (tools,), or before the first substep of free tools (tools, q).
+        """
+        if not self.pushed:
+            return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
         linear, h = self.now.linear, self.grid.least
         if not over_all(self.grid.comm, int((w != linear.w).any())):
             return linear.motion

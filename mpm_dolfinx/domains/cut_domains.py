@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from math import prod
 
@@ -82,6 +82,10 @@ class Patches:
     def now(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the current positions (n, d), m."""
         return interpolate(points.corners[self.at], self.xi)
+
+    def positions(self, points: MaterialPoints) -> Callable[[str], NDArray[np.float64]]:
+        """Return the function that gives user functions the reference or current positions."""
+        return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the current outward area vectors (n, d), m^(d-1)."""

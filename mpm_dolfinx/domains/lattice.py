@@ -19,7 +19,7 @@ a wall, a prescribed displacement, a plate or another body.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 from mpi4py import MPI
 
@@ -32,7 +32,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
-from mpm_dolfinx.grid.grid import SIDES, Grid, among, in_chunks
+from mpm_dolfinx.grid.grid import Grid, among, in_chunks
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -93,22 +93,18 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
-        return self._held_of(ids)[0]
+        return self.held_of(ids)[0]
 
-    def corners_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the indices (m, 2^d) of corners in the body, and which of these corners touch other bodies."""
-        return self._nodes(ids), self._held_of(ids)[1]
-
-    def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return the result of `given`, and which corners (m, 2^d) of the domains touch other bodies."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-            number = self._nodes(ids)
+            number = self.nodes(ids)
             return np.stack([among(number, of_axis) for of_axis in self._given], axis=2), among(number, self._contacts)
 
         return self._held(ids, held)
 
-    def _nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the indices (m, 2^d) of the corners of domains in the body."""
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
@@ -121,11 +117,11 @@ class Lattice:
         """
         if self._count is None:
             return np.zeros_like(d)
-        number = self._nodes(ids)
+        number = self.nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         shape = tuple(np.add(self._count, 1))
         change = _change(comm, shape, number.ravel(), values, self._tolerance, self._thirds).reshape(d.shape)
-        change[self._held_of(ids)[1]] = 0.0
+        change[self.held_of(ids)[1]] = 0.0
         return change
 
 
@@ -185,7 +181,7 @@ def _change(
 def _filtered(
     d: NDArray[np.float64],
     crossed: NDArray[np.float64],
-    thirds: Sequence[NDArray[np.float64]] | None = None,
+    thirds: Sequence[NDArray[np.float64]] | None,
     axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
     """Return values on a box (..., k) of sites, filtered along some axes (default: all); nan marks missing sites.
@@ -242,32 +238,13 @@ def lattices(
     return out
 
 
-def given(
-    grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
-) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners a condition or a wall prescribes; walls: name -> components."""
+def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.bool_]:
+    """Return which components (n, 2^d, d) of corners conditions prescribe."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
         out[rows] = lattice.given(points.id[rows])
-    for name, axes in walls.items():
-        axis, end = SIDES[grid.dim][name]
-        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.finest[axis]
-        for letter in axes:
-            out[:, :, "xyz".index(letter)] |= at_wall
     return out
-
-
-def stopped(
-    grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, clipped to fixed walls; and to other sides, if they were inside `before`."""
-    shut = np.zeros((2, grid.dim), dtype=bool)
-    for name, axes in walls.items():
-        axis, end = SIDES[grid.dim][name]
-        shut[end, axis] = "xyz"[axis] in axes
-    corners = np.where(shut[0] | (before >= grid.low), np.maximum(corners, grid.low), corners)
-    return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -275,7 +252,8 @@ def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray
     numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
-        numbers[rows], touching[rows] = lattice.corners_of(points.id[rows])
+        ids = points.id[rows]
+        numbers[rows], touching[rows] = lattice.nodes(ids), lattice.held_of(ids)[1]
     return numbers, touching
 
 

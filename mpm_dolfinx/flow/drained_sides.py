@@ -24,14 +24,13 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Setting
 from mpm_dolfinx.conditions.conditions import Drained, Inflow, Rain
-from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, on_side
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.exchange import everywhere, over_all
 
 THICK = np.sqrt(2)
 """(Area of the largest plane section of a cube) / (area of a face).  Source: exact bound (Ball 1986).
@@ -69,8 +68,8 @@ class DrainedSides(Feeding):
         self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
         self.varies = any(callable(getattr(one, name)) for one in outlets.values() for name in one.FUNCTIONS)
         self.varies |= any(self._ponds)
-        for one, other in combinations(self._outlets, 2):
-            check_apart(*one, *other)
+        for (one, faces), (other, others) in combinations(self._outlets, 2):
+            faces.check_apart(others, (one, other))
         self._constant: Latest[OpenSides] = Latest()
 
     @property
@@ -108,13 +107,13 @@ class DrainedSides(Feeding):
         grid, rows = self._grid, []
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
-            given, n = everywhere(grid, partial(outlet.through, wet.t, on_side(p, wet.points))), len(p.x)
+            given, n = everywhere(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
             columns = np.empty((n, 5 + grid.dim))
             for k, column in enumerate((i, *given)):
                 columns[:, k] = column
             columns[:, 5:] = p.area(wet.points)
             rows.append((p.cell, p.x, columns))
-        cell, x, values = gathered(grid, rows, 5 + grid.dim)
+        cell, x, values = grid.gathered(rows, 5 + grid.dim)
         number = values[:, 0].astype(np.int64)
         pressure, flux, one_way, driest = values[:, 1:5].T
         area = values[:, 5:]

@@ -351,8 +351,8 @@ class Rows:
                 self._fixed.append((columns, names[f]))
             start = columns.stop
         self._width = start
-        self._room: Latest[NDArray[np.float64]] = Latest()
         self._packed: Latest[Packed] = Latest()
+        self._room: Latest[NDArray[np.float64]] = Latest(self._packed)
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the current values of the fields that change between assemblies for the same points."""
@@ -361,7 +361,6 @@ class Rows:
     def room(self, size: int) -> NDArray[np.float64]:
         """Return a buffer for at least `size` rows.  It is kept between steps, because allocation of memory is slow."""
         if self._room.value is None or size > len(self._room.value):
-            self._packed.clear()
             return self._room(size, lambda: np.zeros((size, self._width)))
         return self._room.value
 
@@ -371,10 +370,9 @@ class Rows:
         """Return the rows of the chosen points, at the start of the buffer.  `live`: result of the method `live`."""
         if isinstance(chosen, slice):
             key = (data.key, chosen.start) if chosen.start else data.key
-            rows, dofs = self._packed(key, lambda: self._pack(data, chosen))
         else:
-            self._packed.clear()
-            rows, dofs = self._pack(data, chosen)
+            key = object()  # no later call has the same points
+        rows, dofs = self._packed(key, lambda: self._pack(data, chosen))
         for columns, name, _ in self._changing:
             rows[:, columns] = live[name][chosen]
         for columns, values, at in dofs:

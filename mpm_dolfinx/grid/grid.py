@@ -26,6 +26,7 @@ from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
 from mpm_dolfinx.grid.partition import destinations, owners
+from mpm_dolfinx.parallel.exchange import Exchange
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
@@ -556,6 +557,14 @@ class Grid:
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
         return self.locals[number]
+
+    def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
+        """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
+        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
+        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+        travel = Exchange(self.comm, self.owner(parts[0]))
+        cell, x, values = map(travel.send, parts)
+        return self.local(cell), x, values
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the indices along the axes and the index of the copy (n, d + 1) of local nodes (n,)."""

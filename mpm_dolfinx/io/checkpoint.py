@@ -30,8 +30,7 @@ from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
-from mpm_dolfinx.stepping.state import State, Stay, Trend
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import State, Stay, StepControl, Trend
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 13  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"

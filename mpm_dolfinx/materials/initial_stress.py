@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
 EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress: end of Newton's method, largest allowed value
 MOST = 30  # largest number of Newton iterations
@@ -343,16 +343,13 @@ class _ElasticStrains:
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return the points at their positions, with the elastic strains of `moved`, the same points after deformation."""
-    F = moved.F_of_laws
-    d = F.shape[1]
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
-    whole = np.tile(np.eye(3), (len(F), 1, 1))
-    whole[:, :d, :d] = F
+    whole = unstretched(moved.F_of_laws)
     if "seeded_stretch" in data:
-        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=whole @ data["seeded_stretch"])
+        out = _with(out, np.ones(len(whole), dtype=bool), seeded_stretch=whole @ data["seeded_stretch"])
     if "plastic" in data:
         stretch = materials.table(points, _prestretch)
         whole = whole * (stretch[:, None, :] / stretch[:, :, None])  # D^-1 F D

@@ -26,15 +26,16 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
-from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
+
+ARTEFACT = "%s: not at its prescribed position at %s: %s"
 
 
 class HoldForms:
@@ -81,15 +82,14 @@ class GivenDisplacements(Acting):
         self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
-        self._warned: set[int] = set()  # indices of the conditions with a warning in the log
-        self._jumped: set[int] = set()  # likewise, for jumps at the start
+        self._warned: set[tuple[int, str]] = set()  # indices of the conditions with a warning in the log, and its text
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
             if common := sorted(set(axes) & set(more)):
-                check_apart(one, faces, other, others)
-                self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
-        self._holds = self.held = held_faces(setting)
+                faces.check_apart(others, (one, other))
+                self._meeting.append((one, other, common, sides.meeting(faces, others)))
+        self._holds = self.held = setting.held
         for hold in displacements.values():
             if not callable(hold.value):  # values of functions are checked when they are called
                 hold.at(0.0, np.empty((1, d)))
@@ -114,11 +114,10 @@ class GivenDisplacements(Acting):
             strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
             sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
             jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
-            if jump and number not in self._jumped:
+            if jump:
                 what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: %s"
                 why = "values count from the start or the last reset_displacement, must begin at the present position"
-                warn(self._grid.comm, ConditionWarning, what, line(hold), jump, place.start, why)
-                self._jumped.add(number)
+                self._warn(number, what, jump, place.start, why)
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep: one for each component and each cell or point."""
@@ -175,12 +174,12 @@ class GivenDisplacements(Acting):
             values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
             rows.append((p.cell, p.x, values))
             bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
-        cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
+        cell, x, values = self._grid.gathered(rows, 6 + 5 * d)
         extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
         sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
         inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
         if over_all(self._grid.comm, int((inner != cell).any())):
-            cell, x, values = gathered(self._grid, [(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
+            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
         number, *own = values[:, :6].T
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
@@ -194,7 +193,7 @@ class GivenDisplacements(Acting):
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
-        return everywhere(self._grid, lambda: hold.at(t, X))
+        return everywhere(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return reactions, by quantity and name of the condition, with every component equal to `value`."""
@@ -205,20 +204,19 @@ class GivenDisplacements(Acting):
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
-        self._warn(held, loads.row, data["direction"].argmax(axis=1), force)
+        told = {number for number, what in self._warned if what == ARTEFACT}
+        for number, x in held.beyond(loads.row, data["direction"].argmax(axis=1), force, told):
+            why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
+            self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
         sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
-    def _warn(
-        self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
-    ) -> None:
-        """Warn, once for each condition, if a reaction exceeds any stress increment that the body can bear."""
-        for number, x in held.beyond(row, axis, force, self._warned):
-            why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
-            what = "%s: not at its prescribed position at %s: %s"
-            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), x + self._grid.base, why)
-            self._warned.add(number)
+    def _warn(self, number: int, what: str, *values) -> None:
+        """Warn, once for each condition, of what is wrong with the condition with this index."""
+        if (number, what) not in self._warned:
+            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
+            self._warned.add((number, what))
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise NotConverged if all points of a side follow less than half of their prescribed increment."""
@@ -394,10 +392,3 @@ class HoldLoads(Loads):
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions."""
         return {"reactions": self._acting.reactions(self, at)}
-
-
-def held_faces(setting: Setting) -> list[tuple[Displacement, Surface, Sequence[int]]]:
-    """Return the conditions of a stage with the faces and the axes on which they are imposed."""
-    holds = [(hold, hold.axes(setting.grid.dim)) for hold in setting.of(Displacement).values()]
-    others = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
-    return [(hold, setting.sides.held(hold, rest), axes) for (hold, axes), rest in zip(holds, others, strict=True)]

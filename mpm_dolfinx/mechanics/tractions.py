@@ -25,11 +25,10 @@ from mpm_dolfinx.base.validation import by_place
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import Pressure, Traction
-from mpm_dolfinx.conditions.sides import everywhere, on_side
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.grid.grid import SIDES, Grid
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -60,7 +59,7 @@ class SideLoads(Acting):
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
-        values = everywhere(grid, lambda: [self._given(of, place.t, on_side(p, place.points)) for of, p in both])
+        values = everywhere(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
         forces = [self._on(of, value, p, place.points) for (of, p), value in zip(both, values, strict=True)]
         return places, travel.send(np.concatenate(forces))
 

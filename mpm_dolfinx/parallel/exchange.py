@@ -107,6 +107,18 @@ def first(comm: MPI.Intracomm, message: str) -> str:
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
 
 
+def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
+    """Return the values of user functions on this process.  An error on one process is raised on all processes."""
+    message, value = "", None
+    try:
+        value = ask()
+    except ValueError as error:
+        message = str(error)
+    if message := first(comm, message):
+        raise ValueError(message)
+    return value
+
+
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
     """Return on every process the result of `action` on rank 0; if `action` raises, all processes raise its error."""
     value = error = None

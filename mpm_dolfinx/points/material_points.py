@@ -63,6 +63,13 @@ def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.
     return out
 
 
+def unstretched(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return F (n, 3, 3), without stretch out of plane if F is (n, 2, 2)."""
+    out = np.tile(np.eye(3), (len(F), 1, 1))
+    out[:, : F.shape[1], : F.shape[1]] = F
+    return out
+
+
 def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the scaled in-plane part and the out-of-plane stretch of F (n, 3, 3): the inverse of `in_space`."""
     across = F[:, 2, 2]

@@ -21,7 +21,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Smallest reduced step / nominal step, for equal steps and for adaptive steps.

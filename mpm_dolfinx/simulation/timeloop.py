@@ -34,8 +34,7 @@ from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rul
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import State, StepControl
 
 PARTS = (
     "cut domains",

@@ -217,7 +217,8 @@ class LinearSolvers:
                 factorise(self.solve_u.pc, self._solve_s.pc)
                 # reused within a step only, because a resumed run lacks factors of earlier steps
                 kept.operator = not self.scheme.richardson and data is None
-        self._tell_unread()
+        if first:
+            self._tell_unread()
         return True
 
     def _tell_unread(self) -> None:
@@ -225,10 +226,9 @@ class LinearSolvers:
         if not self.scheme.petsc_options:
             return
         comm = self.du.comm.tompi4py()
-        names = sorted(set.intersection(*map(set, comm.allgather(self._unread))))
+        names = sorted(set.intersection(*comm.allgather(self._unread)))
         if names:
             warn(comm, ConditionWarning, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
-        self._unread.clear()
 
     def solve(
         self,

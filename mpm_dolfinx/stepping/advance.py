@@ -18,10 +18,11 @@ from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
+from mpm_dolfinx.conditions.walls import fixed_corners, stopped
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
 from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
-from mpm_dolfinx.domains.lattice import filtered, given, seeded, stopped
+from mpm_dolfinx.domains.lattice import filtered, given, seeded
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.forms.point_forms import PointData
@@ -312,7 +313,7 @@ class Motion:
         stage = state.stage
         folded = 0
         grid = cut.grid
-        own = ~given(grid, stage.lattices, stage.conditions["walls"], state.points)
+        own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
         for one in loads:
             near |= one.near(state.points, state.points.corners + moved)
@@ -341,6 +342,11 @@ class Motion:
             F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
 
+    def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return which components (n, 2^d, d) of corners neither conditions prescribe nor walls fix."""
+        fixed = fixed_corners(self._momentum.grid, stage.conditions["walls"], points.corners)
+        return ~(given(stage.lattices, points) | fixed)
+
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
@@ -352,12 +358,11 @@ class Motion:
         number, held = seeded(stage.lattices, points)
         for one in loads:
             held |= one.near(state.points, points.corners)
-        walls = stage.conditions["walls"]
-        own = ~given(grid, stage.lattices, walls, points)
+        own = self._own(stage, points)
         free, body = own & ~held[:, :, None], self._body(points)
         domains = Domains(points.id, points.corners, points.volume0 * points.J, yielded, free, body, number)
         corners = with_volumes(grid, domains)
-        corners[yielded] = stopped(grid, walls, corners[yielded], points.corners[yielded])
+        corners[yielded] = stopped(grid, stage.conditions["walls"], corners[yielded], points.corners[yielded])
         for one in loads:
             corners = one.outside(corners, own)
         return replace(points, corners=corners, x=centroids(corners))

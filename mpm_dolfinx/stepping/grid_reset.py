@@ -251,8 +251,8 @@ class OnGrid(Keyed):
         store: NDArray[np.float64],
         stage: Stage,
         t: float,
-        water: PoreWater | None = None,
-        at_rest: AtPlaces | None = None,
+        water: PoreWater | None,
+        at_rest: AtPlaces | None,
     ) -> list[NDArray[np.float64]]:
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 

@@ -28,7 +28,6 @@ from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Loads, Place
 from mpm_dolfinx.conditions.conditions import Quiet
-from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
 from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.domains.fitted import fitted_at
@@ -41,7 +40,7 @@ from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.exchange import everywhere, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
@@ -322,7 +321,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
     points = replace(points, data=data)
-    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))
+    return everywhere(scene.grid.comm, lambda: scene.materials.changed("stage: fields", points, fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:

@@ -39,7 +39,7 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import FACES, centroids, volumes
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
@@ -261,9 +261,9 @@ class Renewal:
         F = ratio[:, None, None] ** (1 / d) * np.eye(d)
         data = {}
         logs = np.zeros((len(points), 3, 3))
-        logs[work.affected] = _log(self._elastic(points, np.flatnonzero(work.affected)))
+        logs[work.affected] = _of_tensors(np.log, self._elastic(points, np.flatnonzero(work.affected)))
         across = np.exp(mean(np.log(points.data[ACROSS]))) if ACROSS in points.data else None
-        data["plastic"] = _pulled(F, across, _exp(kept(logs)))
+        data["plastic"] = _pulled(F, across, _of_tensors(np.exp, kept(logs)))
         for name, values in points.data.items():
             if name in touched:
                 data[name] = work.on_faces(values, corners, parent, group, points)
@@ -289,9 +289,7 @@ class Renewal:
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points with indices `rows`."""
-        F = np.tile(np.eye(3), (len(rows), 1, 1))
-        seen = points.F_of_laws[rows]
-        F[:, : seen.shape[1], : seen.shape[1]] = seen
+        F = unstretched(points.F_of_laws[rows])
         return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
 
 
@@ -300,20 +298,13 @@ def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 
-def _log(b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a function, such as np.log, of symmetric tensors b (n, 3, 3)."""
     value, axes = np.linalg.eigh(b)
-    return (axes * np.log(value)[:, None]) @ axes.swapaxes(1, 2)
-
-
-def _exp(e: NDArray[np.float64]) -> NDArray[np.float64]:
-    value, axes = np.linalg.eigh(e)
-    return (axes * np.exp(value)[:, None]) @ axes.swapaxes(1, 2)
+    return (axes * function(value)[:, None]) @ axes.swapaxes(1, 2)
 
 
 def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return C_p^-1 (n, 3, 3) for elastic left Cauchy-Green tensors b (n, 3, 3) and F."""
-    whole = np.tile(np.eye(3), (len(F), 1, 1))
-    seen = F if across is None else in_space(F, across)
-    whole[:, : seen.shape[1], : seen.shape[1]] = seen
-    inverse = np.linalg.inv(whole)
+    inverse = np.linalg.inv(unstretched(F if across is None else in_space(F, across)))
     return inverse @ b @ inverse.swapaxes(1, 2)

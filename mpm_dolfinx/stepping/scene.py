@@ -124,9 +124,9 @@ class Scene:
         self.motion = Motion(scene, bodies, self.momentum, self.storage, self.numerics.keep_volumes)
         # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
-        self._on_grid: Latest[OnGrid] = Latest()
-        self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
+        self._on_grid: Latest[OnGrid] = Latest(self._assembled)
+        self._systems: Latest[System] = Latest()
         self._renewed: Latest[tuple[dict[str, Any], int]] = Latest()
         _ = self._renewal  # raises ValueError for scenes that do not support renewal
 
@@ -207,7 +207,6 @@ class Scene:
         grid = self.grid
 
         def make() -> OnGrid:
-            self._assembled.clear()  # the coefficients of the forms change now
             with _compat.Timer("cut domains"):
                 more = self.momentum.inertia is not None, self.storage is not None
                 cut = CutDomains(grid, points, self.numerics.quadrature == "domain", *more)
@@ -334,5 +333,5 @@ class Scene:
 
     def forget(self) -> None:
         """Delete all data of a step, which may have been interrupted anywhere."""
-        for made in (self._assembled, self._systems, self._on_grid):
+        for made in (self._systems, self._on_grid):
             made.clear()

@@ -45,8 +45,8 @@ from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
-from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Source, Traction, sorted_terms
+from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.grid.grid import TURN, Grid, side

@@ -36,8 +36,7 @@ class _Rings:
         self._values, self.start = _tiled(values, count), _tiled(start, count)
 
     def _data(self, stretches: NDArray[np.float64], state: State, repeat: int = 1):
-        F = np.tile(np.eye(3), (len(stretches), 1, 1))
-        F[:, 0, 0], F[:, 1, 1] = stretches.T
+        F = np.insert(stretches, 2, 1.0, axis=1)[:, None] * np.eye(3)
         cells = np.arange(len(F), dtype=np.int32) % 8
         inputs = {name: np.concatenate([v] * repeat) for name, v in (self._values | state).items()}
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
