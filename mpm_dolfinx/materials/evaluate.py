@@ -224,6 +224,9 @@ class SoftnessAtPoints:
     modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from
     the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
+    At rest the strain is rounding, and its direction is random.  G_t is therefore a weighted mean: the modulus of the
+    step has the weight e : e, the modulus before the step the weight `NEAR`^4.  A step at rest thus changes nothing.
+
     Parameters
     ----------
     grid, law, shapes, stretches
@@ -247,15 +250,12 @@ class SoftnessAtPoints:
         tau = law.first_piola(F, values) * F.T
         e = ufl.sym(points.dF * ufl.inv(points.F))
         e -= ufl.tr(e) / d * ufl.Identity(d)
-        size = ufl.sqrt(ufl.inner(e, e) + NEAR**4)
-        self._along = PointExpression(ufl.as_vector([size, ufl.inner(ufl.diff(tau, s), e) / size]), points)
+        self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
-    def __call__(
-        self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64], dt: float
-    ) -> NDArray[np.float64]:
+    def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
         """Return the softness (n,), in [1, MOST], of points with F, parameters and state.
 
-        dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa; dt: length of the step, s.
+        dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): last softness.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -263,10 +263,9 @@ class SoftnessAtPoints:
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
         if self._local is not None:
             self._local.update(data)
-        strain, change = self._along.evaluate(data).T
-        elastic = 2 * shear * strain
-        soft = elastic / np.maximum(change, elastic / MOST)
-        return np.where(strain > NEAR**2, np.maximum(soft, 1.0), 1.0)
+        weight, work = self._along.evaluate(data).T
+        elastic = 2 * shear * (weight + NEAR**4)
+        return np.clip(elastic / np.maximum(work + 2 * shear * NEAR**4 / before, elastic / MOST), 1.0, MOST)
 
 
 class ConductivityAtPieces:

@@ -537,7 +537,7 @@ class SceneMaterials:
             shear = self.table(points, lambda m: m.shear)
             for number, softness in self._softness.items():
                 _, rows, at = placed[number]
-                out["softness"][rows] = softness(at, dF[rows], shear[rows], dt)
+                out["softness"][rows] = softness(at, dF[rows], shear[rows], dt, before.data["softness"][rows])
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
