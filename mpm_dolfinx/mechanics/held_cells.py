@@ -162,14 +162,7 @@ class HeldCells:
         than half of its displacement in the cell, its displacement must vary over this cell. This is checked at the
         start and the end of the step. The penalty is then omitted if other penalties hold a free node of the cell.
 
-        Parameters
-        ----------
-        axis
-            The component.
-        given : (conditions,)
-            Conditions that prescribe the component.
-        free : (nodes,)
-            Nodes that no wall fixes in this component.
+        axis: the component; given (conditions,): conditions that prescribe it; free (nodes,): nodes that no wall fixes.
 
         Returns
         -------
@@ -225,12 +218,8 @@ class HeldCells:
         penalties then push the side to and fro. Only the sum of their forces at the nodes acts on the body and counts
         in the reaction. A penalty thus exceeds its limit only if its own force and the condition's nodal forces do.
 
-        Parameters
-        ----------
-        row, axis, force : (k,)
-            Penalty (its index), component (its axis), and force, N.
-        told
-            Indices of conditions that have been reported already; they are excluded.
+        row, axis, force (k,): penalty (its index), component (its axis), and force, N; told: indices of conditions that
+        have been reported already, which are excluded.
         """
         grid = self.grid
         comm = grid.comm
