@@ -234,16 +234,8 @@ def _check_overlaps(
     Each facet inside the mesh has a cell on both sides.  The number of cells at a position therefore changes only
     across the surface, and an overlap involves a cell with a facet on the surface.
 
-    Parameters
-    ----------
-    x : (nodes, d), m
-        Positions of the nodes.
-    cells
-        Nodes of the cells by cell type.
-    outer : (m,)
-        Indices of the cells with a facet on the surface.
-    neighbours : (n, 2)
-        Pairs of cells that share a facet.
+    x (nodes, d): positions, m; cells: nodes of the cells by cell type; outer (m,): cells with a facet on the surface;
+    neighbours (n, 2): pairs of cells that share a facet.
     """
     corners = [x[nodes] for nodes in cells.values()]
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])

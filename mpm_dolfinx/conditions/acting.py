@@ -125,10 +125,11 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Displacement increment u of the step (a local array), m, and the numbering of the unknowns."""
+    """Displacement increment u of the step (a local array), m, the numbering of unknowns, and connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
+    parts: Parts | None = None
 
     @property
     def nodal(self) -> NDArray[np.float64]:

@@ -49,7 +49,7 @@ class Pairs:
     pressure: NDArray[np.float64]  # contact pressure at the point before the step (m,), Pa
     shear: NDArray[np.float64]  # shear traction at the point before the step (m, d), Pa
     x: NDArray[np.float64]  # position of the point in the undeformed grid (m, d), m
-    sign: NDArray[np.float64]  # sign of the forces on points in the results (contacts,)
+    sign: NDArray[np.float64]  # sign of the forces on points in the results (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at w (m, d), m.

@@ -19,7 +19,7 @@ Forces are therefore f + D e (load - e . f) / s; minus their derivative is D - (
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -33,8 +33,8 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
-from mpm_dolfinx.contact.history import Origin, Rough, pressure_name, shear_name
-from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
+from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
+from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
@@ -362,7 +362,8 @@ class ContactProblem(Loads):
         found = self.found(at)
         law = self.now.law
         state = self.now.state
-        new = law.augmented(state, found.touch, self.pairs.x)
+        part = at.parts.cells[law.cell]
+        new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
         if new is not state or not self.pushed:
             return new is not state
@@ -386,17 +387,21 @@ class ContactProblem(Loads):
 
     def follow(self, at: At) -> bool:
         """Update the pairs at u; return whether this changes the equilibrium."""
-        if self._again is None or self.now.state.follows == FOLLOWS:
+        if self._again is None:
             return False
-        new = Current(*self._again(at.u), self.now.state)
-        new, off = self._continued(new, at)
-        if off <= DEPTH:
-            return False
-        self.now = new
-        return True
+        new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
+        if late.any():  # in these parts alone are pairs replaced
+            both = self.now, new
+            chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
+            kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
+            origin, order = joined([of.origin for of in both], kept)
+            law = ContactLaw(new.law.names, new.law.contacts, _merged([of.law.pairs for of in both], kept, order))
+            order = np.argsort(np.concatenate([of.law.key[rows] for rows, of in zip(chosen, both, strict=True)]))
+            self.now = Current(law, origin, _merged([of.state for of in both], chosen, order))
+        return bool(late.any())
 
-    def _continued(self, new: Current, at: At) -> tuple[Current, float]:
-        """Return the contact with pairs found at u, and the largest change of a gap by this update / cell size.
+    def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
+        """Return the contact with pairs found at u, and the connected parts (parts,) in which gaps change by `DEPTH`.
 
         Pairs that are open before and after the update are ignored.
         """
@@ -412,14 +417,18 @@ class ContactProblem(Loads):
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
             values[new_at] = getattr(state, name)[old_at]
-        fresh = replace(fresh, **carried, raised=state.raised, follows=state.follows + 1)
+        of_old, of_new = at.parts.cells[law.cell], at.parts.cells[now.cell]
+        updates = at.parts.largest(self.grid.comm, of_old, state.updates)
+        updates = np.where(updates < 0, BEGIN, updates)
+        fresh = replace(fresh, **carried, updates=updates[of_new] + [0, 0, 0, 1])
         _, row, old_at = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
         push = found.touch.push
         off, missing = np.maximum(-gap, 0.0), push > 0
         off[row] = np.where((push[old_at] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[old_at]), 0.0)
         missing[old_at] = False
-        most = float(off.max(initial=0.0)) / self.grid.least if not missing.any() else np.inf
-        return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
+        off = np.concatenate([off / self.grid.least, np.where(missing, np.inf, 0.0)])
+        most = at.parts.largest(self.grid.comm, np.concatenate([of_new[now.of], of_old[law.of]]), off)
+        return Current(now, new.origin, fresh), (most > DEPTH) & (updates[:, 3] < FOLLOWS)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
         """Return the points with updated contact pressures and shear tractions at u."""
@@ -483,6 +492,13 @@ class ContactProblem(Loads):
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
+
+
+def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
+    """Return the flagged rows of two pairs or states as one, in some order."""
+    names = (f.name for f in fields(both[1]) if f.name != "grid")
+    columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
+    return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:

@@ -237,7 +237,7 @@ class Tools(Touching):
         cell, place, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
-        acts = np.ones(len(self.tools)), self.tools, poses
+        acts = np.ones(len(number)), self.tools, poses
         pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
@@ -252,12 +252,7 @@ class Tools(Touching):
         The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
         than a cell keeps its whole contact.
 
-        Parameters
-        ----------
-        x, unit : (m, d), m, -
-            Positions on the surface of the bodies, and outward normals.
-        faces : (m,)
-            Which of these positions face the tool.
+        x, unit (m, d): positions on the surface, m, and outward normals; faces (m,): which of these face the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -334,16 +329,8 @@ class Tools(Touching):
 
         Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
 
-        Parameters
-        ----------
-        corners : (n, 2^d, d), m
-            Corners of the domains.
-        t
-            Time, s.
-        free : (n, 2^d, d)
-            Components that no other condition prescribes.
-        most
-            (Largest penetration that is corrected) / cell size.
+        corners (n, 2^d, d): corners of the domains, m; t: time, s; free (n, 2^d, d): components that no other condition
+        prescribes; most: (largest penetration that is corrected) / cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:

@@ -137,17 +137,10 @@ def _change(
 
     The lattice is distributed over the processes in slabs along its first axis.
 
-    Parameters
-    ----------
-    shape, number
-        Number of lattice sites along each axis; lexicographic index (m,) of the site of each row of values.  Several
-        rows may belong to one site.
-    values : (m, k + 1)
-        Values, and in the last column the number of crossed cells.
-    tolerance : (k + 1,)
-        Largest difference between rows of a site.  If it is exceeded, the domains have separated; the site is left out.
-    thirds : (4, n - 3) along each axis
-        Weights of third differences of n corners, for domains of different widths, see `_divided`.
+    shape: number of lattice sites along each axis; number (m,): lexicographic number of the site of each row of values.
+    values (m, k + 1): values, and the number of crossed cells.  tolerance (k + 1,): largest difference between rows of
+    a site; if it is exceeded, the domains have separated, and the site is left out.  thirds (4, n - 3) along each axis:
+    weights of third differences of n corners, for domains of different widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across

@@ -127,16 +127,9 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return the principal Kirchhoff stresses, Pa, for ordered principal trial strains.
+    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives (n, 3, 3), and 1 in plastic flow, else 0 (n,).
 
-    Parameters
-    ----------
-    e : (n, 3)
-        Principal strains, the largest first; the other arguments are parameters (n,).
-
-    Returns
-    -------
-    Stresses (n, 3); derivatives with respect to the strains (n, 3, 3); 1 in plastic flow, else 0 (n,).
+    e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,).
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic

@@ -164,14 +164,7 @@ class HeldCells:
         extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
         the displacement must vary over the cell. The penalty is then omitted if others hold a free node of the cell.
 
-        Parameters
-        ----------
-        axis
-            The component.
-        given : (conditions,)
-            Conditions that prescribe the component.
-        free : (nodes,)
-            Nodes that no wall fixes in this component.
+        axis: the component; given (conditions,): conditions that prescribe it; free (nodes,): nodes that no wall fixes.
 
         Returns
         -------
@@ -227,12 +220,8 @@ class HeldCells:
         penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
         counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
 
-        Parameters
-        ----------
-        row, axis, force : (k,)
-            Penalty (its index), component (its axis), and force, N.
-        told
-            Indices of conditions that have been reported already; they are excluded.
+        row, axis, force (k,): penalty (its index), component (its axis), and force, N; told: indices of conditions that
+        have been reported already, which are excluded.
         """
         grid = self.grid
         comm = grid.comm

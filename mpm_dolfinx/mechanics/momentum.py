@@ -445,7 +445,7 @@ class MomentumProblem:
     @cached_property
     def at(self) -> At:
         """The present displacements."""
-        return At(self.system.unknowns, self.forms.u.x.array)
+        return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
 
     def settle(self, sticks: bool) -> bool:
         """Update stick and slip at u; return whether any state changed; sticks: whether slip may change to stick."""

@@ -486,14 +486,9 @@ def _products(
 ) -> list[NDArray[np.float64]]:
     """Return the integrals over the pieces of products of two coordinates, from the lower corners of their cells.
 
-    Parameters
-    ----------
-    pairs
-        Axes of the two coordinates, ascending.
-    x, sums, area
-        Vertices (d, d, m) of slices, their sums (d, m), and areas (m,) of slices, projected along the first axis.
-    pair, total
-        Functions: sum over the vertices of slices of the product of two coordinates; sum of slice values in each slot.
+    pairs: axes of the two coordinates, ascending.  x, sums, area: vertices (d, d, m) of slices, their sums (d, m), and
+    areas (m,) of slices, projected along the first axis.  pair, total: functions that return the sum over the vertices
+    of slices of the product of two coordinates, and the sum of slice values in each slot.
     """
     d = len(x)
 
@@ -581,12 +576,8 @@ def _polygons(
 
     The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
-    Parameters
-    ----------
-    s : (3, a, n)
-        Corners of the slices: first positions for slicing, last barycentric coordinates in the triangle.
-    owner : (n,)
-        Index of the triangle of each slice.
+    s (3, a, n): corners of the slices, first positions for slicing, last barycentric coordinates in the triangle; owner
+    (n,): index of the triangle of each slice.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]

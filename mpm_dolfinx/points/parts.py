@@ -28,6 +28,12 @@ class Parts:
     cells: NDArray[np.int64]  # part of each active local cell, from 0, else -1
     nodes: NDArray[np.int64]  # part of each active local node, from 0, else -1
 
+    def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the largest values (count, ...) in each part, of values (n, ...) in parts (n,); else -inf."""
+        out = np.full((self.count, *values.shape[1:]), -np.inf)
+        np.maximum.at(out, part, values)
+        return over_all(comm, out, MPI.MAX)
+
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
@@ -126,6 +132,17 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     place[over_all(grid.comm, first, MPI.MIN).argsort()] = np.arange(count)
     out[cells] = place[own] + 1
     return out, count
+
+
+def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the connected part (n,), from 0, of domains with corners (n, 2^d, d), m, in copies of the grid (n,)."""
+    cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
+    cell, at = np.unique(cell, return_inverse=True)
+    own, count = _touching(
+        np.stack([*np.unravel_index(cell % grid.cells, tuple(grid.shape)), cell // grid.cells], axis=1)
+    )
+    of = own[at.reshape(corners.shape[:2])]
+    return _joined(np.repeat(np.arange(len(of)), of.shape[1]), of.ravel(), (len(of), count))[0]
 
 
 def joined_parts(

@@ -187,12 +187,8 @@ def _shared(
 
     The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
-    Parameters
-    ----------
-    keys : (n,)
-        Coarse candidates of this process, ascending, below `count`.
-    stated : (n,)
-        Status of each candidate on this process: MAYBE, NOT or IS; the largest value of all processes counts.
+    keys (n,): coarse candidates of this process, ascending, below `count`; stated (n,): status of each candidate on
+    this process, MAYBE, NOT or IS, of which the largest value of all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

@@ -302,12 +302,10 @@ class Motion:
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
         """Return the points with new F, and with corners moved by `moved` (n, 2^d, d), m, and the correction `bend`.
 
+        Also return whether each point (n,) keeps its pieces, see `OnGrid.valid`, and the number of inverted domains.
+
         If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`:
         the deformation there is permanent, and domains in kinks would give wrong values.
-
-        Returns
-        -------
-        The points; whether each point (n,) keeps its pieces, see `OnGrid.valid`; number of inverted domains.
         """
         cut = on_grid.cut
         stage = state.stage
