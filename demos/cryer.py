@@ -4,8 +4,8 @@
 A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained.  The outer shell
 drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
 falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Fluid and grains are incompressible,
-nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the sphere; with --axisymmetric, a quarter
-of a disc.
+nu = 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a quarter
+of a disc is computed.
 
 Errors of the pressure at the centre, with the reduced time T = c_v t / R²: `peak` is the relative error of the largest
 pressure; `curve` is the largest error from T = 0.02 on, divided by p0.

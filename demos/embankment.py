@@ -114,7 +114,7 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
             dt = (end - simulation.t) / count
             result = simulation.run(end, dt, probes=probes, observe=observe, progress=False)
             out.wall, out.steps = out.wall + result.wall, out.steps + result.steps
-            if last and part != 1:  # just after the last lift, and in the end
+            if last and part != 1:  # just after the last lift, and at the end
                 points = simulation.points
                 title = f"{simulation.t / DAY:.0f} days after the first lift"
                 out.frames.append((title, points.corners.copy(), points.pressure))
@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None) -> dict:
         print(f"the clay's lowest points carry {bund.carried:.4f} of the weight of the lifts")
         print(f"settlement on the axis: {-bund.axis[-1]:.3f} m, at the toe {-bund.toe[-1]:.3f} m")
         most, end = max(bund.excess) / 1e3, bund.excess[-1] / 1e3
-        print(f"excess pressure in mid-clay: {most:.1f} kPa at most, {end:.2f} at the end")
+        print(f"excess pressure in the middle of the clay: {most:.1f} kPa at most, {end:.2f} kPa at the end")
         draw(o, bund)
         print(f"{bund.steps} steps, {bund.wall:.1f} s")
     return out

@@ -89,8 +89,8 @@ def main(argv: list[str] | None = None) -> dict:
         out["energy"] = float(np.abs(total - total[0]).max() / e["external"][-1])
         out["left"] = float((e["kinetic"] + e["elastic"])[-1] / e["external"][-1])
         rows = [["amplification, largest error", f"{out['amplification']:.2%}"]]
-        rows += [["energies out of balance, of the work of the wave", f"{out['energy']:.2%}"]]
-        common.table([["", ""], *rows, ["energy that is left, of that work", f"{out['left']:.1e}"]])
+        rows += [["error of the energy balance / work of the wave", f"{out['energy']:.2%}"]]
+        common.table([["", ""], *rows, ["remaining energy / work of the wave", f"{out['left']:.1e}"]])
         usual = (o.cells, o.steps) == (20, 500)
         out["converged"] = not usual or all(out[name] <= most for name, most in BOUNDS.items())
         draw(o, result, surface, f[band], found[band])

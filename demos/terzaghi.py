@@ -104,8 +104,10 @@ def main(argv: list[str] | None = None) -> dict:
         outcome = run(o.cells, o.steps, method=o.method, rtol=o.rtol)
         out |= {"errors": errors(outcome), "steps": outcome.result.steps, "wall_s": outcome.result.wall}
         print(f"{o.cells} cells, {out['steps']} steps, {out['wall_s']:.1f} s")
-        scales = {"p_0.1": "p0", "p_0.5": "p0", "p_1": "p0", "settlement": "itself at T_v = 0.5"}
-        common.table([["error", "", "of"], *([name, f"{out['errors'][name]:.4%}", of] for name, of in scales.items())])
+        scales = {"p_0.1": "p0", "p_0.5": "p0", "p_1": "p0", "settlement": "exact value"}
+        common.table(
+            [["error", "", "scale"], *([name, f"{out['errors'][name]:.4%}", of] for name, of in scales.items())]
+        )
         draw(o, outcome)
     return out
 
