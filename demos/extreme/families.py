@@ -284,7 +284,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Column under its weight, dry (rho g H / E = 1e-6 ... 10) or wet: exact height; beam: tip against finite elements."""
+    """Column under its weight, dry (rho g H / E = 1e-6 ... 10) or wet: exact height; beam: tip against elements."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio
