@@ -45,7 +45,7 @@ PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", tractio
 
 @dataclass
 class Outcome:
-    """The axis of the beam (m, 2), m, at each alpha, from the middle of the clamp."""
+    """The axis of the beam (k, 2), m, at each alpha, from the middle of the clamp."""
 
     axis: dict[int, np.ndarray]
     result: mpm.Result
@@ -70,7 +70,7 @@ def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, floa
 
 
 def rod(alpha: float) -> np.ndarray:
-    """Return the axis of the rod (m, 2), m, at the arc lengths ARC."""
+    """Return the axis of the rod (k, 2), m, at the arc lengths ARC."""
     axial, transverse = YOUNG * HEIGHT, 5 / 6 * RUBBER.shear * HEIGHT
     return shear_flexible_rod(LENGTH, axial, transverse, STIFFNESS, -alpha * STIFFNESS / LENGTH**2, points=ARC)
 

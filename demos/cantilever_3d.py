@@ -83,7 +83,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces (m, 4, 3), m, of the body's domains, and the axial stretch of each."""
+    """Return the faces (k, 4, 3), m, of the body's domains, and the axial stretch of each."""
     (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):

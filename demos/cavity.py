@@ -42,7 +42,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, with lambda and kappa in terms of v and the Cauchy stress."""
+    """Return the clay of Chen and Abousleiman, with lambda and kappa converted from v and Cauchy stresses."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)

@@ -3,7 +3,7 @@
 
 A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained.  The outer shell
 drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
-falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Fluid and grains are incompressible,
+falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this rise.  Fluid and grains are incompressible,
 nu = 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a quarter
 of a disc is computed.
 
@@ -64,7 +64,7 @@ def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
 
 @dataclass
 class Outcome:
-    """Reduced times (m,), pressures at the centre divided by p0 (m,), and the cost of the run."""
+    """Reduced times (k,), pressures at the centre divided by p0 (k,), and the cost of the run."""
 
     T: np.ndarray
     pressure: np.ndarray

@@ -72,7 +72,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, m, with `steps` equal steps of each length in `SETTLES`, and in the drawdown."""
+    """Run the dam on cells of size h, m, with `steps` equal steps in each period of `SETTLES`, and in the drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:

@@ -10,9 +10,9 @@ are separate.  Reference solutions are converged in space and in time.
   0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
 * drained: the same beam without water, loaded in ten steps; error of the tip deflection against 67 x 20 Taylor-Hood
   elements
-* terzaghi: error of the settlement at T_v = 0.5, against the exact one
-* mandel: error of the settlement of the plate at T = 0.1, against the exact one
-* column: error of the height of the soft column under its own weight, against the exact one
+* terzaghi: error of the settlement at T_v = 0.5, against the exact settlement
+* mandel: error of the settlement of the plate at T = 0.1, against the exact settlement
+* column: error of the height of the soft column under its own weight, against the exact height
 """
 
 from __future__ import annotations

@@ -80,7 +80,10 @@ def stretch(stress: Callable[[float], float]) -> float:
 
 
 def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
-    """Return labels and values of an `Example`: displacements of the points; stretches: of four layers, exact."""
+    """Return labels and values of an `Example`: displacements of the points.
+
+    stretches: exact stretches of four layers, from below.
+    """
     Y, u = displacements(s)
     exact = np.interp(Y, np.linspace(0, 1, 5), np.concatenate([[0], np.cumsum(stretches - 1) / 4]))
     return "height at the start (m)", "displacement (m)", Y, u, exact
@@ -117,7 +120,7 @@ def energy(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Fibrous(mpm.NeoHookean):
-    """Neo-Hookean matrix with fibres: + c/4 (I_4 - 1)^2, I_4 = |F a|^2, a the direction of the fibres."""
+    """Neo-Hookean matrix with fibres of direction a, which add the energy c/4 (I_4 - 1)^2 with I_4 = |F a|^2."""
 
     fibre: float = 0.0  # c, Pa
     direction: mpm.Field = (1.0, 0.0)

@@ -13,8 +13,8 @@ one of these outcomes:
 * wrong, nan or hung: a defect, which the exit status reports.
 
 An error is divided by the largest exact value, unless the docstring of its family defines the error otherwise.  The
-condition number refers to the last tangent of the momentum balance, scaled to a unit diagonal.  `wrong` also counts
-errors of an unknown kind.  On one process.
+condition number refers to the last tangent of the momentum balance, scaled to a unit diagonal.  Unexpected
+exceptions also count as wrong.  On one process.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ class Frame:
     """State of footing and soil at one time of a push.
 
     t: time divided by the duration of the push.  settlement: divided by B.  corners (n, 4, 2), m, and pore pressure
-    (n,), Pa, of the domains.  top (m, 2): positions of the soil's surface, from the middle outward, m.
+    (n,), Pa, of the domains.  top (k, 2): positions of the soil's surface, from the middle outward, m.
     """
 
     t: float
@@ -120,9 +120,9 @@ class Frame:
 class Push:
     """Results of a push.
 
-    settlement, load: after each step, divided by B and by B c.  frames: states at some times.  pushed: index of the
-    last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the initial
-    surface of the soil.
+    settlement, load: settlement / B and load / (B c) after each step.  frames: states at some times.  pushed: index of
+    the last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the
+    initial surface of the soil.
     """
 
     settlement: list[float] = field(default_factory=lambda: [0.0])

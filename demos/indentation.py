@@ -36,7 +36,7 @@ TIMES = np.geomspace(1e-4, 10, 21)  # times at which the force is recorded, divi
 
 @dataclass
 class Contact:
-    """Contact at one time: force, N/m, and positions (m,), m, and pressures (m,), Pa, of points at the gel's surface.
+    """Contact at one time: force, N/m, and positions (k,), m, and pressures (k,), Pa, of points at the gel's surface.
 
     most, half: largest pressure, Pa, and half-width, m, of the ellipse fitted to these pressures.
     """

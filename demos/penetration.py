@@ -67,7 +67,11 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles at which domains around the bar meet; ahead of it, at 0, `nose` is the ratio of widths."""
+    """Return the angles between which the domains around the bar lie; angle 0 is ahead of the bar.
+
+    around: number of domains of equal width.  nose: width of the narrowest domains, ahead of the bar, divided by this
+    width; 1: all domains have this width.
+    """
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -109,7 +113,7 @@ class Push:
 
     steady: whether this step counts in the error of N.
 
-    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
+    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (k, 4, 2), m.  The field is the
     displacement of the points since the clay was seeded, divided by that of the bar; in wet clay the excess pressure
     divided by s_u.  lines: final grid lines along both axes, m.
     """

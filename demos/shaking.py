@@ -3,9 +3,9 @@
 
 A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  The computed ground ends at an absorbing base, 5 m
 below the layer.  A shear pulse enters through this base, and reflections from layer and surface leave through it.  The
-sides have no vertical displacement, as in an infinite layer. The reference motion is that of a free surface of the
-ground without the layer, which is twice the incoming wave.  The spectrum of the surface motion, divided by that of the
-reference motion, is
+sides have no vertical displacement, as in an infinite layer. The reference is the motion of a free surface of the
+ground without the layer; this motion is twice the incoming wave.  The spectrum of the surface motion, divided by that
+of the reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 

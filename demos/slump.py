@@ -51,7 +51,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank with a probe on its crest; cells: over its height; room: floor in front of it, m."""
+    """Return the consolidated bank with a probe on its crest; cells: over its height; room: floor in front, m."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -111,7 +111,7 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 class Frame:
     """State of the bank at one time, s.
 
-    corners of the domains, m; surface: positions (m, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic
+    corners of the domains, m; surface: positions (k, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic
     strain; volume, m²; cohesion, Pa.
     """
 

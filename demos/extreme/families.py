@@ -64,14 +64,14 @@ def decades(low: int, high: int, step: int = 1) -> list[float]:
 
 @family(0.01)
 def conductivity():
-    """Beam that drains at its free end, k = 1e-14 ... 1e2 m/s: tip against finite elements."""
+    """Beam that drains at its free end, k = 1e-14 to 1e2 m/s: tip against finite elements."""
     for k in decades(-14, 2):
         yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
 
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures, error of the settlement; exact."""
+    """Terzaghi's layer, dt = 1e-9 to 1e9 s: mean error of the pressures, error of the settlement; exact."""
     water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
@@ -94,14 +94,14 @@ def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.01)
 def time_step_of_a_beam():
-    """Beam that drains at its free end, dt = 1e-9 ... 1e9 s: tip against finite elements."""
+    """Beam that drains at its free end, dt = 1e-9 to 1e9 s: tip against finite elements."""
     for dt in decades(-9, 9, 3):
         yield f"dt = {dt:.0e} s", Beam(SOIL, WATER, end=8 * dt)
 
 
 @family(0.01)
 def fluid_bulk():
-    """Sealed column and beam, K_w = 1e4 Pa ... infinity: exact pressure and settlement; tip against finite elements."""
+    """Sealed column and beam, K_w = 1e4 Pa to infinity: exact pressure and settlement; tip against finite elements."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -134,7 +134,7 @@ def beside(beam: Beam, limit: Beam) -> Scene:
 
 @family(0.02)
 def poisson():
-    """Beam with and without water, nu = 0 ... 0.499: tip against finite elements."""
+    """Beam with and without water, nu = 0 to 0.499: tip against finite elements."""
     for nu in (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.499):
         truth = (80, 32) if nu > 0.45 else (40, 16)
         yield f"drained, nu = {nu}", Beam(soil(nu=nu), truth=truth)
@@ -156,7 +156,7 @@ DROP = 1e-2  # pressure difference, Pa, too small to move the layers
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, ratio of k 1e-8 ... 1e8: pressures / pressure difference, exact."""
+    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures / pressure difference, exact."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -175,7 +175,7 @@ def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def contrast_of_stiffness():
-    """Two layers under large and tiny loads, ratio of E 1e-6 ... 1e6: exact settlement."""
+    """Two layers under large and tiny loads, ratio of E 1e-6 to 1e6: exact settlement."""
     for name, cut in CUTS.items():
         for ratio in decades(-6, 6, 1 if cut == 0.5 else 2):
             for strain in (1e-2, 1e-6, 1e-10) if ratio in (1e-6, 1e6) else (1e-2,):
@@ -196,7 +196,7 @@ def offset():
 
 @family(0.02)
 def rotation():
-    """Loaded square, rotated by 0 ... 90 degrees: exact volume, pressure; mean pressure against a finer grid."""
+    """Loaded square, rotated by 0 to 90 degrees: exact volume, pressure; mean pressure against a finer grid."""
     K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
     J = stretch(1e5 / (2 * K)) ** 2
     a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
@@ -231,14 +231,14 @@ def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def rotation_of_a_beam():
-    """Beam rotated by 5 ... 90 degrees, with prescribed displacements at its end: tip against finite elements."""
+    """Beam rotated by 5 to 90 degrees, with prescribed displacements at its end: tip against finite elements."""
     for angle in (5, 15, 30, 45, 60, 75, 90):
         yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
 
 
 @family(0.01)
 def points_per_cell():
-    """Beam with 1 ... 5 points per cell and direction: tip against finite elements."""
+    """Beam with 1 to 5 points per cell and direction: tip against finite elements."""
     for n in range(1, 6):
         for y in (0.0, 0.3):
             many = {"per_cell": n, "offset": y, "h": (0.025, 0.025)}
@@ -247,7 +247,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Beam and column, outermost cells filled to 1e-10 ... 0.5: tip against finite elements; exact settlement."""
+    """Beam and column, filling of the outermost cells 1e-10 to 0.5: tip against finite elements; exact settlement."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -284,7 +284,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Column under its weight, dry (rho g H / E = 1e-6 ... 10) or wet: exact height; beam: tip against elements."""
+    """Column under its weight, dry (rho g H / E = 1e-6 to 10) or wet: exact height; beam: tip against elements."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio
@@ -300,7 +300,7 @@ def weight():
 
 @family(0.01)
 def suction():
-    """Column with pore pressure p = -10 ... 0.5 M: exact settlement; refused if pores close or without equilibrium."""
+    """Column with pore pressure p = -10 to 0.5 M: exact settlement; refused if pores close or without equilibrium."""
     for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
         a = stretch(-ratio) if ratio < exp(-1) else nan
 
@@ -317,7 +317,7 @@ def suction():
 
 @family(0.02)
 def buckling():
-    """Slender cantilever under 0.5 ... 2 times its buckling load: tip against finite elements in 40 steps."""
+    """Slender cantilever under 0.5 to 2 times its buckling load: tip against finite elements in 40 steps."""
     # under a larger load the beam would curl back behind its clamp, where the grid ends
     critical = np.pi**2 * M * 0.1**2 / 12 / 4
     slender = Beam(load=200.0, size=(1.0, 0.1), truth=(40, 4), truth_steps=40, h=(0.0125, 0.0125), ramp=1.0)
@@ -350,7 +350,7 @@ def pressed(material, load: float) -> Error | None:
 
 @family(0.01)
 def units():
-    """Beam of 1e-6 ... 1e6 m, or E = 1 ... 1e15 Pa: tip against finite elements for 1 m and 10 MPa."""
+    """Beam of 1e-6 to 1e6 m, or E = 1 to 1e15 Pa: tip against finite elements for 1 m and 10 MPa."""
     exact = Beam().elements()
     for x in decades(-6, 6, 3):
         beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))
@@ -362,7 +362,7 @@ def units():
 
 @family(1e-4)
 def rain():
-    """Column under rain, k = 1e-12 ... 1 m/s, alpha h = 1e-3 ... 1e3: exact heads.
+    """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: exact heads.
 
     The rain increases from k / 20 to k / 2.  The soil is Gardner's, and stands on a water table.
     """
@@ -388,7 +388,7 @@ def rained(k: float, steep: float) -> Scene:
 
 @family(1e-4)
 def evaporation():
-    """Drying column above a water table, k = 1e-12 ... 1 m/s, alpha h = 1e-3 ... 1e2: exact heads.
+    """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: exact heads.
 
     The head of the air is -1.5 m.
     """
@@ -414,7 +414,7 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 
 @family(1e-4)
 def layered_rain():
-    """Two layers under rain, ratio of k 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: exact heads.
+    """Two layers under rain, ratio of k 1e-3 to 1e3, alpha h = 1e-2 to 1e2: exact heads.
 
     The interface is off the grid lines.  One scene is in axisymmetry, and one in 3D.
     """
@@ -498,7 +498,7 @@ def exponential(
 
 @family(1e-3)
 def ponding():
-    """Ponded column of van Genuchten's soil, n = 1.2 ... 7, initial heads of -1 ... -100 m: exact steady heads."""
+    """Ponded column of van Genuchten's soil, n = 1.2 to 7, initial heads of -1 to -100 m: exact steady heads."""
     for n in (1.2, 2.0, 7.0):
         for head in (-1.0, -10.0, -100.0):
             for alpha in (0.5, 15.0):
