@@ -138,7 +138,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=60, help="steps in which the cohesion is lost")
     o = parser.parse_args(argv)
     if not 5 <= o.cells <= 40 or o.cells % 5 or o.steps < 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be a multiple of 5 from 5 to 40, and >= 10")
+        parser.error(f"--cells {o.cells}: must be a multiple of 5 from 5 to 40; --steps {o.steps}: must be >= 10")
     with common.results(o) as out:
         free, held = slump(o.cells, o.steps, False), slump(o.cells, o.steps, True)
         before, end = held.frames[-2:]

@@ -88,7 +88,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=40, help="equal increments of the load to alpha = 10")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10 or o.steps % 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1, and a multiple of 10")
+        parser.error(f"--cells {o.cells}: must be >= 1; --steps {o.steps}: must be a multiple of 10")
     with common.results(o) as out:
         found, outcome = run(o.cells, o.steps)
         out |= {"errors": found, "wall_s": outcome.result.wall}

@@ -187,7 +187,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation ratios, undrained")
     o = parser.parse_args(argv)
     if o.cells < 2 or any(not 1 <= ratio < 10 for ratio in o.ratios):
-        parser.error(f"--cells {o.cells} --ratios {o.ratios}: must be >= 2, and in [1, 10)")
+        parser.error(f"--cells {o.cells}: must be >= 2; --ratios {o.ratios}: must be in [1, 10)")
     with common.results(o) as out:
         out |= {"errors": {}, "balance": 0.0}
         dry, wet = {}, {}

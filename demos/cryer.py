@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--profile", action="store_true", help="print the run time of each part of the program")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.steps < 1:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 2 and >= 1")
+        parser.error(f"--cells {o.cells}: must be >= 2; --steps {o.steps}: must be >= 1")
     with common.results(o) as out:
         found, outcome = run(o.cells, o.steps, o.axisymmetric)
         result = outcome.result

@@ -212,7 +212,7 @@ def main(argv: list[str] | None = None) -> dict:
     if not 0 < len(o.h) <= len(COLORS):
         parser.error(f"--h: {len(o.h)} cell sizes, must be 1 to {len(COLORS)}")
     if o.steps < 2 or o.steps % 2 or o.cycles < 1:
-        parser.error(f"--steps {o.steps} --cycles {o.cycles}: must be even and >= 2, and >= 1")
+        parser.error(f"--steps {o.steps}: must be even and >= 2; --cycles {o.cycles}: must be >= 1")
     with common.results(o) as out:
         runs = {h: cycle(h, o.load, o.cycles, o.steps) for h in o.h}
         points = cycle(o.h[-1], o.load, o.cycles, o.steps, "point")

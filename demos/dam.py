@@ -180,7 +180,8 @@ def main(argv: list[str] | None = None) -> dict:
     )
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1 or not 10 <= o.cells <= 200:
-        parser.error(f"--h {o.h} --steps {o.steps} --cells {o.cells}: must be 0.1 to 1 m, >= 1, and 10 to 200")
+        h, steps = f"--h {o.h}: must be 0.1 to 1 m", f"--steps {o.steps}: must be >= 1"
+        parser.error(f"{h}; {steps}; --cells {o.cells}: must be 10 to 200")
     with common.results(o) as out:
         flow = rectangular(o.cells)
         print(f"rectangular dam, {o.cells} cells high: flow over the exact one {flow:.4f}", flush=True)

@@ -133,7 +133,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=6, help="steps between two lifts")
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1:
-        parser.error(f"--h {o.h} --steps {o.steps}: must be between 0.1 and 1 m, and >= 1")
+        parser.error(f"--h {o.h}: must be 0.1 to 1 m; --steps {o.steps}: must be >= 1")
     with common.results(o) as out:
         bund = run(o.h, o.steps)
         out |= {"carried": bund.carried, "settlement": -bund.axis[-1], "wall_s": bund.wall}

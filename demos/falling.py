@@ -75,7 +75,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--dt", type=float, default=0.005, help="step, s")
     o = parser.parse_args(argv)
     if o.cells < 3 or not 1e-4 <= o.dt <= 0.05:
-        parser.error(f"--cells {o.cells} --dt {o.dt:g}: must be >= 3, in [1e-4, 0.05]")
+        parser.error(f"--cells {o.cells}: must be >= 3; --dt {o.dt:g}: must be in [1e-4, 0.05]")
     with common.results(o) as out:
         s, parts = scene(o.cells)
         result, rows, shapes = fall(s, parts, o.dt)

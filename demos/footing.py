@@ -240,9 +240,9 @@ def main(argv: list[str] | None = None) -> dict:
     if o.graded and (o.steps, o.depth) != (None, 1.0):
         parser.error("--graded: must go without --steps and --depth")
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
-        parser.error(f"--cells {o.cells} --depth {o.depth:g}: must be odd and >= 3, and in (0, 1.5]")
+        parser.error(f"--cells {o.cells}: must be odd and >= 3; --depth {o.depth:g}: must be in (0, 1.5]")
     if o.steps is not None and (o.steps < 1 or not 1 <= o.box <= 32):
-        parser.error(f"--steps {o.steps} --box {o.box:g}: must be >= 1, and in [1, 32]")
+        parser.error(f"--steps {o.steps}: must be >= 1; --box {o.box:g}: must be in [1, 32]")
     if not 0 <= o.viscosity <= 1:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
     if o.steps is None and (o.box, o.method, o.viscosity) != (BOX[0], methods[0], 0.0):

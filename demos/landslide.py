@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--dt", type=float, default=0.05, help="step of the slide, s")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or not 0.01 <= o.dt <= 0.2:
-        parser.error(f"--cells {o.cells} --dt {o.dt:g}: must be even and >= 2, in [0.01, 0.2]")
+        parser.error(f"--cells {o.cells}: must be even and >= 2; --dt {o.dt:g}: must be in [0.01, 0.2]")
     with common.results(o) as out:
         s, other = slope(o.cells), still.slope(o.cells)
         before = s.points.corners.copy()

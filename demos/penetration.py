@@ -228,9 +228,10 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
-        parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 4], in [0, 1]")
+        cells, depth = f"--cells {o.cells}: must be 4 to 32", f"--depth {o.depth}: must be in (0, 4]"
+        parser.error(f"{cells}; {depth}; --rough {o.rough}: must be in [0, 1]")
     if not 4 <= o.wet_cells <= 32 or not 0 < o.wet_depth <= 1:
-        parser.error(f"--wet-cells {o.wet_cells} --wet-depth {o.wet_depth}: must be 4 to 32, in (0, 1]")
+        parser.error(f"--wet-cells {o.wet_cells}: must be 4 to 32; --wet-depth {o.wet_depth}: must be in (0, 1]")
     runs = {}
     with common.results(o) as out:
         out |= {"errors": {}, "cuts": 0, "steps": 0}

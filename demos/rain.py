@@ -235,7 +235,7 @@ def main(argv: list[str] | None = None) -> dict:
     if o.cells < 5:
         parser.error(f"--cells {o.cells}: must be >= 5")
     if o.slope < 0 or o.slope % 2 or not 0.005 <= o.slide_step <= 0.2:
-        parser.error(f"--slope {o.slope} --slide-step {o.slide_step:g}: must be 0, 2, 4, ..., in [0.005, 0.2]")
+        parser.error(f"--slope {o.slope}: must be 0, 2, 4, ...; --slide-step {o.slide_step:g}: must be in [0.005, 0.2]")
     with common.results(o) as out:
         s = column(o.cells)
         curves = [(0.0, *found(s))]

@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=WAYS)
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 40 or any(not 0 <= delta <= 20 for delta in o.delta):
-        parser.error(f"--cells {o.cells} --delta {o.delta}: must be 4 to 40, 0 to 20 degrees")
+        parser.error(f"--cells {o.cells}: must be 4 to 40; --delta {o.delta}: must be 0 to 20 degrees")
     with common.results(o) as out:
         out |= {"errors": {}, "moments": {}, "cuts": 0, "steps": 0}
         rows, runs = [["wall", "exact", "Coulomb", "thrust", "moment"]], {}

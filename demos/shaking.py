@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=500, help="steps of the run")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 50:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, >= 50")
+        parser.error(f"--cells {o.cells}: must be even and >= 4; --steps {o.steps}: must be >= 50")
     with common.results(o) as out:
         result, surface = shaken(o.cells, o.steps)
         came = incoming(result.t)

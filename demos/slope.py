@@ -77,8 +77,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--rtol", type=float, default=0.01, help="relative accuracy of the factor of safety")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or o.steps < 1 or not 1e-3 <= o.rtol <= 0.1:
-        options = f"--cells {o.cells} --steps {o.steps} --rtol {o.rtol:g}"
-        parser.error(f"{options}: must be even and >= 2, >= 1, and in [1e-3, 0.1]")
+        options = f"--cells {o.cells}: must be even and >= 2; --steps {o.steps}: must be >= 1"
+        parser.error(f"{options}; --rtol {o.rtol:g}: must be in [1e-3, 0.1]")
     with common.results(o) as out:
         s = slope(o.cells)
         before = s.points.corners.copy()

@@ -245,7 +245,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=100, help="number of steps in which the cohesion decreases")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, and >= 10")
+        parser.error(f"--cells {o.cells}: must be even and >= 4; --steps {o.steps}: must be >= 10")
     with common.results(o) as out:
         failures = []
         for cells in (o.cells // 2, o.cells):

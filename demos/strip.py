@@ -139,7 +139,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--reference", action="store_true", help="also run Taylor-Hood elements on the same cells")
     o = parser.parse_args(argv)
     if o.cells < 5 or not 0 < o.load <= 1 or o.steps < 4 or o.steps % 2:
-        parser.error(f"--cells {o.cells} --load {o.load} --steps {o.steps}: must be >= 5, in (0, 1], even and >= 4")
+        cells, load = f"--cells {o.cells}: must be >= 5", f"--load {o.load}: must be in (0, 1]"
+        parser.error(f"{cells}; {load}; --steps {o.steps}: must be even and >= 4")
     with common.results(o) as out:
         outcome = run(o.cells, o.load, o.steps)
         found = errors(outcome) if o.load == 0.25 and not outcome.why else {}

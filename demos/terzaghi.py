@@ -99,7 +99,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--method", choices=tuple(METHODS), default="sdirk2", help="time integration")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1 and >= 10")
+        parser.error(f"--cells {o.cells}: must be >= 1; --steps {o.steps}: must be >= 10")
     with common.results(o) as out:
         outcome = run(o.cells, o.steps, method=o.method, rtol=o.rtol)
         out |= {"errors": errors(outcome), "steps": outcome.result.steps, "wall_s": outcome.result.wall}

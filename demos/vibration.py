@@ -97,8 +97,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=40, help="steps in a period of the bar")
     o = parser.parse_args(argv)
     if min(o.cells, o.periods) < 1 or o.steps < 8 or any(abs(DEPTH / h % 1 - 0.5) < 0.49 or h > 0.1 for h in o.h):
-        options = f"--h {o.h} --cells {o.cells} --periods {o.periods} --steps {o.steps}"
-        parser.error(f"{options}: must be parts of 0.3 m up to 0.1, >= 1, >= 1 and >= 8")
+        options = f"--h {o.h}: 0.3 m / h must be an integer, h <= 0.1 m; --cells {o.cells}, --periods {o.periods}"
+        parser.error(f"{options}: must be >= 1; --steps {o.steps}: must be >= 8")
     with common.results(o) as out:
         beams = {(way, h): struck(h, way) for h in o.h for way in EXACT}
         out["frequency_errors"] = {way: [beams[way, h][2] / EXACT[way] - 1 for h in o.h] for way in EXACT}

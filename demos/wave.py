@@ -133,7 +133,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--periods", type=int, default=6, help="periods of the harmonic load")
     o = parser.parse_args(argv)
     if min(o.cells, o.steps) < 8 or o.periods < 2:
-        parser.error(f"--cells {o.cells} --steps {o.steps} --periods {o.periods}: must be >= 8, >= 8 and >= 2")
+        parser.error(f"--cells {o.cells}, --steps {o.steps}: must be >= 8; --periods {o.periods}: must be >= 2")
     with common.results(o) as out:
         dry = {base: sudden(o.cells, base) for base in ("rigid", "quiet")}
         found = {base: run["stress"][(run["t"] > 1.3) & (run["t"] < 2.7)] for base, run in dry.items()}
