@@ -350,7 +350,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
     parser.add_argument("--quick", action="store_true", help="one pair of small blocks, one turn")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # of MAKES, in a process of its own
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # index in MAKES
     o = parser.parse_args(argv)
     if min(o.cells, o.repeat) < 1:
         parser.error(f"--cells {o.cells} --repeat {o.repeat}: must be >= 1")

@@ -38,7 +38,7 @@ from mpm_dolfinx.stepping import step
 from mpm_dolfinx.stepping.balances import balances
 
 K_DT = np.array([-23, -16, -12, -10, -9, -8, -7, -6, -5, -4, -3, -2, 0, 3, 7, 11])  # log10 of k dt in m
-BULK = (1e4, 1e6, 2.2e9, np.inf)  # of the water, Pa
+BULK = (1e4, 1e6, 2.2e9, np.inf)  # bulk modulus of the water, Pa
 SCHEMES = {
     "Schur-CG": ("cg", 0.75, FILTER),
     "Schur-CG, plain operator": ("cg", 0.75, 0.0),

@@ -67,7 +67,7 @@ SOIL = mpm.DruckerPrager(
 WATER = mpm.Fluid()
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-3}  # V
-COLOURS = ("C0", "C1", "C2")  # of the rates
+COLOURS = ("C0", "C1", "C2")  # one for each rate
 STEP = 1 / 14  # fraction of a cell that the footing moves in a step
 BOX = (8.0, 2.5)  # width and height of half the soil, divided by B
 COARSE = 5  # largest number of cells over the width, in runs with a box twice as wide
@@ -186,7 +186,7 @@ def push(
 
     def observe(s: mpm.Simulation) -> None:
         out.settlement.append(depth * min(1, s.t / end))
-        area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # of half of the strip
+        area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # m^2: disc, or half of the strip
         out.load.append(-s.reactions["footing"][1] / (area * COHESION))
         if len(out.load) % 5 == 0 or s.result.converged:
             corners, pressure = common.whole(s, "corners", "pressure")

@@ -16,10 +16,10 @@ Source: Lu and Godt (2008) for vertical flow; here the component of gravity norm
 Errors: the largest error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
 
 With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and a
-cohesion that vanishes with slip stabilise the bank.  The suction decreases until equilibrium is impossible.  With
-inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks:
-balances of energy and water.  With 6 cells over its height, the bank fails after 1.7 h and runs out by 3.2 m; with 10
-cells, after 1.5 h and by 2.7 m.  On one process.
+cohesion that falls to a tenth with slip stabilise the bank.  The suction decreases until equilibrium is impossible.
+With inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.
+Checks: balances of energy and water.  With 6 cells over its height, the bank fails after 1.7 h and runs out by 3.2 m;
+with 10 cells, after 1.5 h and by 2.7 m.  On one process.
 """
 
 from __future__ import annotations

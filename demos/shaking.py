@@ -23,7 +23,7 @@ import numpy as np
 import mpm_dolfinx as mpm
 
 LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground in the scene
-SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # of ground and layer: m/s, kg/m³, -
+SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # ground, layer: m/s, kg/m³; both: -
 PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: frequency and middle of Ricker's wavelet, duration of the run
 BAND = (0.5, 6.5)  # Hz: range in which spectra are compared
 BOUNDS = {"amplification": 0.03, "energy": 0.01}

@@ -134,7 +134,7 @@ def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict
     sand.set(xlabel="axial strain (-)", ylabel="q / p0, 10 x volume growth (-)", title="Mohr-Coulomb sand, drained")
     for ax in (path, curve, water, sand):
         ax.grid(alpha=0.3)
-    path.legend(fontsize=8)  # of all three panels
+    path.legend(fontsize=8)  # the legend for all three panels
     sand.legend(fontsize=8, loc=(0.45, 0.45))
     common.save(fig, out / "triaxial.png", dpi=90)
 
