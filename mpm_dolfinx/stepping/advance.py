@@ -171,8 +171,13 @@ class Motion:
         trend = self._followed(state, points, t - state.t) if self._trends else None
         new = replace(state, t=t, points=points, pieces=carried, stay=stay, trend=trend)
         keeps = keeps & stays
-        some, others = over_all(grid.comm, np.array([keeps.any(), not keeps.all()], dtype=float)) > 0
-        if not others:
+        again = np.append(keeps.any(), not keeps.all())
+        if self._storage is not None:
+            again = np.append(again[:1], np.bincount(self._body(points)[~keeps], minlength=len(self._bodies)))
+        some, *again = over_all(grid.comm, again.astype(float)) > 0
+        if report is not None:
+            report.first = report.first * again
+        if not any(again):
             return new, folded
         new = replace(self.left_grid(new, on_grid), held=None, rest=None)
         if some:
@@ -430,14 +435,6 @@ class Motion:
         inside = np.zeros((len(self._bodies), count), dtype=bool)
         inside[self._body(points), on_grid.parts[0]] = True
         return largest_of_bodies(self._momentum.grid.comm, part[cells] - 1, values, inside)
-
-    def resets(self, state: State) -> NDArray[np.bool_]:
-        """Return which bodies (bodies,) have points that do not keep their pieces."""
-        count, stay = len(self._bodies), state.stay
-        if state.stays:
-            return np.zeros(count, dtype=bool)
-        body = self._body(state.points) if stay is None else self._body(state.points)[~stay.keeps]
-        return over_all(self._momentum.grid.comm, np.bincount(body, minlength=count)) > 0
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the index of each point's body (n,)."""
