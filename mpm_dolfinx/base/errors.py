@@ -10,11 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def _none() -> NDArray[np.float64]:
-    """Return the pressure changes, Pa, of a step without fluid."""
-    return np.zeros(1)
-
-
 @dataclass
 class Report:
     """Report of a converged time step.  Pressures are cell pressures; see `motion_error` for the motion."""
@@ -27,11 +22,11 @@ class Report:
     renewed: int = 0  # number of particle domains replaced by renewal
     easy: bool = True  # whether a longer step may converge too
     error: float = 0.0  # estimated error of the pressures, Pa
-    change: NDArray[np.float64] = field(default_factory=_none)  # largest pressure changes of bodies in the step, Pa
+    change: NDArray[np.float64] | tuple = (0.0,)  # largest pressure changes of bodies in the step, Pa
     extremes: NDArray[np.float64] | None = None  # minima and maxima, at start and end of the step (2, 2, bodies), Pa
     sealed: float = 0.0  # largest pressure change, Pa, in the same step without flow
-    first: NDArray[np.float64] = field(default_factory=_none)  # in the first substep; 0 for bodies that keep pieces
-    sudden: NDArray[np.float64] = field(default_factory=_none)  # `first`; 0 if pressures change on in the second
+    first: NDArray[np.float64] | tuple = (0.0,)  # in the first substep; 0 for bodies that keep pieces
+    sudden: NDArray[np.float64] | tuple = (0.0,)  # `first`; 0 if pressures change on in the second
     stress: float = 0.0  # root mean square of the nodal forces, divided by the area of a cell face, Pa
     moves: tuple[float, float] = (0.0, 0.0)  # estimated error and size of the motion, see `motion_error`
     fills: tuple[float, float] = (0.0, 0.0)  # in unsaturated soil: estimated error and largest change of water content

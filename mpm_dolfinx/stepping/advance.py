@@ -171,12 +171,12 @@ class Motion:
         trend = self._followed(state, points, t - state.t) if self._trends else None
         new = replace(state, t=t, points=points, pieces=carried, stay=stay, trend=trend)
         keeps = keeps & stays
-        again = np.append(keeps.any(), not keeps.all())
+        again = [not keeps.all()]
         if self._storage is not None:
-            again = np.append(again[:1], np.bincount(self._body(points)[~keeps], minlength=len(self._bodies)))
-        some, *again = over_all(grid.comm, again.astype(float)) > 0
+            again = np.bincount(self._body(points)[~keeps], minlength=len(self._bodies))
+        some, *again = over_all(grid.comm, np.array([keeps.any(), *again], dtype=float)) > 0
         if report is not None:
-            report.first = report.first * again
+            report.first = np.multiply(report.first, again)
         if not any(again):
             return new, folded
         new = replace(self.left_grid(new, on_grid), held=None, rest=None)
