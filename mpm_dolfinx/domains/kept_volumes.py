@@ -6,9 +6,10 @@ cell, and edges stay straight.  In elastic soil F and the volume ratios of cells
 soil F is incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the
 corners of yielded domains therefore move by the smallest d with
 
-    sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2  ->  min,
+    sum_p V_p ((V_p - V - dV/dx d) / V_p)^2 + SOFT^2 sum_p V_p mean |d / h|^2  ->  min,
 
-with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
+with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells along each
+axis.  Both sums are integrals over the soil, so a slice between smooth walls moves as in plane strain.  Shared corners move together.  Corners of elastic domains and
 held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
 projection); volumes of domains, unlike densities, need no second cut by the grid.
 """
@@ -66,14 +67,17 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     fixed = ~(domains.free & yielded[:, None, None])
     held = np.stack([np.bincount(number.ravel(), fixed[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(domains.corners[yielded], grid.axisymmetric)
-    size = np.linalg.norm(slope, axis=(1, 2))
-    at = number[yielded]
+    at, whole = number[yielded], domains.volume[yielded]
+    h = np.broadcast_to(grid.sizes_at(domains.corners[yielded].mean(axis=1)), (len(at), d))
+    share = (whole[:, None] / h**2 / at.shape[1]).repeat(at.shape[1], axis=0)
+    weight = np.stack([np.bincount(at.ravel(), column, count) for column in share.T], axis=1)
+    scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
     columns = at[:, :, None] * d + np.arange(d)
-    values = slope / size[:, None, None] * ~held[at]
+    values = slope / np.sqrt(whole)[:, None, None] * scale[at]
     starts = np.arange(len(at) + 1) * columns[:1].size
     A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
-    missing = (domains.volume[yielded] - now) / size
-    return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
+    motion = lsmr(A, (whole - now) / np.sqrt(whole), damp=SOFT, atol=SAME, btol=SAME)
+    return (motion[0].reshape(-1, d) * scale)[number]
 
 
 def _joined(
