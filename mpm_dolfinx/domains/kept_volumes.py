@@ -6,12 +6,13 @@ cell, and edges stay straight.  In elastic soil F and the volume ratios of cells
 soil F is incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the
 corners of yielded domains therefore move by the smallest d with
 
-    sum_p V_p ((V_p - V - dV/dx d) / V_p)^2 + SOFT^2 sum_p V_p mean |d / h|^2  ->  min,
+    sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2  ->  min,  V_p e_p = V_p - V - dV/dx d,
 
 with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells along each
-axis.  Both sums are integrals over the soil, so a slice between smooth walls moves as in plane strain.  Shared corners move together.  Corners of elastic domains and
-held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
-projection); volumes of domains, unlike densities, need no second cut by the grid.
+axis.  Both sums are integrals over the soil, so a slice between smooth walls moves as in plane strain.  Shared corners
+move together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of
+grid cells in this way (implicit density projection); volumes of domains, unlike densities, need no second cut by the
+grid.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
 """Weight of the motion, needed because corners of a regular lattice do not change alternating volumes to first order.
-Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.3e-04 (relative), doubling it by
-3.2e-04, and finer cells by 9.2e-02.
+Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04 (relative), doubling it by
+1.4e-04, and finer cells by 9.2e-02.
 """
 
 
@@ -68,16 +69,18 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     held = np.stack([np.bincount(number.ravel(), fixed[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(domains.corners[yielded], grid.axisymmetric)
     at, whole = number[yielded], domains.volume[yielded]
-    h = np.broadcast_to(grid.sizes_at(domains.corners[yielded].mean(axis=1)), (len(at), d))
-    share = (whole[:, None] / h**2 / at.shape[1]).repeat(at.shape[1], axis=0)
+    n, corners = at.shape
+    h = np.broadcast_to(grid.sizes_at(domains.corners[yielded].mean(axis=1)), (n, d))
+    share = (whole[:, None] / h**2 / corners).repeat(corners, axis=0)
     weight = np.stack([np.bincount(at.ravel(), column, count) for column in share.T], axis=1)
     scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
-    columns = at[:, :, None] * d + np.arange(d)
-    values = slope / np.sqrt(whole)[:, None, None] * scale[at]
-    starts = np.arange(len(at) + 1) * columns[:1].size
-    A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
-    motion = lsmr(A, (whole - now) / np.sqrt(whole), damp=SOFT, atol=SAME, btol=SAME)
-    return (motion[0].reshape(-1, d) * scale)[number]
+    # the unknowns are weighted motions and errors e, so that rows may be scaled: narrow domains have large slopes
+    values = np.column_stack([(slope * scale[at]).reshape(n, -1) / np.sqrt(whole)[:, None], np.full(n, SOFT)])
+    columns = np.column_stack([(at[:, :, None] * d + np.arange(d)).reshape(n, -1), count * d + np.arange(n)])
+    size = np.linalg.norm(values, axis=1)
+    A = csr_matrix(((values / size[:, None]).ravel(), columns.ravel(), np.arange(n + 1) * columns.shape[1]))
+    found = lsmr(A, (whole - now) / np.sqrt(whole) / size, atol=SAME, btol=SAME)[0]
+    return (found[: count * d].reshape(-1, d) * scale)[number]
 
 
 def _joined(
