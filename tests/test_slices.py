@@ -26,7 +26,7 @@ def scene(across, make):
     conditions = [
         mpm.Traction("top", lambda t: place(0, load * min(1, t)), region=(place(0.2, 0, -1), place(0.4, 1, 1)))
     ]
-    options = {"numerics": mpm.Numerics(tolerance=1e-11, keep_volumes=True)} | options
+    options = {"numerics": mpm.Numerics(tolerance=1e-11)} | options
     conditions += options.pop("conditions", [])
     walls = held if flat else held | {"front": "y", "back": "y"}
     s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=conditions, **options)

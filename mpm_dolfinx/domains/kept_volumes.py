@@ -8,11 +8,10 @@ corners of yielded domains therefore move by the smallest d with
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2  ->  min,  V_p e_p = V_p - V - dV/dx d,
 
-with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells along each
-axis.  Both sums are integrals over the soil, so a slice between smooth walls moves as in plane strain.  Shared corners
-move together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of
-grid cells in this way (implicit density projection); volumes of domains, unlike densities, need no second cut by the
-grid.
+with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells.  Both sums
+are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of elastic
+domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit
+density projection); volumes of domains, unlike densities, need no second cut by the grid.
 """
 
 from __future__ import annotations
@@ -33,8 +32,7 @@ from mpm_dolfinx.parallel.exchange import to_root
 SOFT = 0.1
 """Weight of the motion, needed because corners of a regular lattice do not change alternating volumes to first order.
 Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04 (relative), doubling it by
-1.4e-04, and finer cells by 9.2e-02.
-"""
+1.4e-04, and finer cells by 9.2e-02."""
 
 
 class Domains(NamedTuple):
@@ -70,9 +68,8 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     now, slope = volume_slopes(domains.corners[yielded], grid.axisymmetric)
     at, whole = number[yielded], domains.volume[yielded]
     n, corners = at.shape
-    h = np.broadcast_to(grid.sizes_at(domains.corners[yielded].mean(axis=1)), (n, d))
-    share = (whole[:, None] / h**2 / corners).repeat(corners, axis=0)
-    weight = np.stack([np.bincount(at.ravel(), column, count) for column in share.T], axis=1)
+    share = whole[:, None] / corners / grid.sizes_at(domains.corners[yielded].mean(axis=1)) ** 2
+    weight = np.stack([np.bincount(at.ravel(), column.repeat(corners), count) for column in share.T], axis=1)
     scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
     # the unknowns are weighted motions and errors e, so that rows may be scaled: narrow domains have large slopes
     values = np.column_stack([(slope * scale[at]).reshape(n, -1) / np.sqrt(whole)[:, None], np.full(n, SOFT)])

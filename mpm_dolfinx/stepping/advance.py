@@ -70,7 +70,7 @@ class Motion:
         All bodies of the scene.
     momentum, storage
         Forms of the two balances, with u and p of a solved step; storage is None without fluid.
-    keep_volumes
+    keeps_volumes
         Whether yielded domains keep the volumes of their points, see `kept_volumes`.
     """
 
@@ -80,12 +80,10 @@ class Motion:
         bodies: Sequence[Body],
         momentum: MomentumForms,
         storage: StorageForms | None,
-        keep_volumes: bool,
+        keeps_volumes: bool,
     ):
-        self._keep_volumes = keep_volumes and materials.evolves
-        self._materials = materials
-        self._momentum = momentum
-        self._storage = storage
+        self.keeps_volumes, self._materials = keeps_volumes, materials
+        self._momentum, self._storage = momentum, storage
         self._trends = storage is None and momentum.elastic and not momentum.linear and momentum.inertia is None
         self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
@@ -148,8 +146,8 @@ class Motion:
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
-            if self._keep_volumes:
-                points = self._corrected(points, state, loads, keeps)
+            if self.keeps_volumes:
+                points = self._corrected(points, state, loads, keeps & stays)
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
@@ -343,15 +341,14 @@ class Motion:
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
         """Return the points with corrected corners of yielded domains, except where keeps (n,) is true."""
-        grid, stage = self._momentum.grid, state.stage
+        grid, walls = self._momentum.grid, state.stage.conditions["walls"]
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
             return points
-        number, held = seeded(stage.lattices, points)
+        number, held = seeded(state.stage.lattices, points)
         for one in loads:
             held |= one.near(state.points, points.corners)
-        walls = stage.conditions["walls"]
-        own = ~given(grid, stage.lattices, walls, points)
+        own = ~given(grid, state.stage.lattices, walls, points)
         free, body = own & ~held[:, :, None], self._body(points)
         domains = Domains(points.id, points.corners, points.volume0 * points.J, yielded, free, body, number)
         corners = with_volumes(grid, domains)
