@@ -76,7 +76,7 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     columns = np.column_stack([(at[:, :, None] * d + np.arange(d)).reshape(n, -1), count * d + np.arange(n)])
     size = np.linalg.norm(values, axis=1)
     A = csr_matrix(((values / size[:, None]).ravel(), columns.ravel(), np.arange(n + 1) * columns.shape[1]))
-    found = lsmr(A, (whole - now) / np.sqrt(whole) / size, atol=SAME, btol=SAME)[0]
+    found = lsmr(A, (whole - now) / np.sqrt(whole) / size, atol=SAME**1.5, btol=SAME**1.5)[0]
     return (found[: count * d].reshape(-1, d) * scale)[number]
 
 
