@@ -22,7 +22,7 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
 
-    Both are means over lines on all sides of a position, because a border of domains may lie above the position.
+    Both are means over vertical lines close to a position, on all sides, because borders of domains may lie above it.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ class Probes:
         """Raise ValueError if the scene has other bodies, or if a probe is in an absent body."""
         if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
-            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
+            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in the scene's order")
         body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
         absent = np.flatnonzero(~np.asarray(present)[body])
         if len(absent):
@@ -104,7 +104,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     Raises
     ------
     ValueError
-        A position is outside the bodies.  A run raises it for bodies that are not the scene's, or absent.
+        A position is outside the bodies.  A run raises ValueError if the scene has other bodies, or a body is absent.
     """
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)
