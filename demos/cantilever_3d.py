@@ -25,7 +25,7 @@ import common
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.grid.grid import corner_bits
 from mpm_dolfinx.verification.exact import shear_flexible_rod
 
 LENGTH, SIDE, YOUNG = 1.0, 0.1, 12e6  # m, m, Pa

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
-from mpm_dolfinx.grid.grid import SIDES, Grid, in_chunks
+from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, corner_bits, in_chunks
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, domain_volumes, volumes
+from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import asked, instance, numbers, whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
-from mpm_dolfinx.grid.grid import MOST, Grid, among, in_chunks
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.grid.grid import MOST, Grid, among, corner_bits, in_chunks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -27,8 +27,7 @@ from mpm_dolfinx.bodies.touching import (
     weights,
     within,
 )
-from mpm_dolfinx.grid.grid import ranges, rounding
-from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACES, corner_bits
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACES, corner_bits, ranges, rounding
 
 TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(d)]) for d in (2, 3)}
 """Tangential axes (d, d-1) of the faces normal to each axis."""
@@ -43,7 +42,7 @@ class Surface:
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
-    face: NDArray[np.int64]  # index of the face in its domain (m,), see `cutting.FACES`
+    face: NDArray[np.int64]  # index of the face in its domain (m,), see `grid.FACES`
     # corners of the free part in local coordinates of the domain in [-1, 1] (m, 2^(d-1), d); triangles repeat the last
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m

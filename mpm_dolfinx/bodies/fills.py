@@ -16,10 +16,10 @@ from scipy.sparse import coo_array, csr_array, diags
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
-from mpm_dolfinx.grid.grid import REACH, Grid
+from mpm_dolfinx.grid.grid import FACES, REACH, Grid
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
+from mpm_dolfinx.points.cutting import TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 MISFIT = 0.01  # largest (distance of a fill's straight edges from a bent surface) / cell size without a warning

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.points.cutting import FACES, corner_bits
+from mpm_dolfinx.grid.grid import FACES, corner_bits
 
 KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
 """Types of cells that become particle domains, and their numbers of vertices."""

@@ -23,10 +23,9 @@ from mpm_dolfinx.base.validation import instance, line, line_of, path
 from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded, warn_small
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import FACES, Grid
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
 TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_markers", "CellEntityIds")

@@ -22,9 +22,9 @@ from mpm_dolfinx.base.validation import whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.bodies.touching import Faces, covers, face_vectors
-from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
+from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
 LONG = 1.5  # cells / per_cell: domains with longer edges are divided
 SMALL = 0.2  # of the desired domain size: smaller domains cause a warning

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
 
 
 def overburden(

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACE_SIGNS, FACES, corner_bits, cut_at, kuhn_simplices
+from mpm_dolfinx.points.cutting import cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
 

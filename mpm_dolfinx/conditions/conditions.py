@@ -397,11 +397,6 @@ penalty, multipliers remove the error, see `HoldLoads.augment`.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.
 """
-WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).  Halving
-this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
-finer cells by 3.0e-02.
-"""
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables, because yielding soil is much softer.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by

@@ -19,8 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.grid.grid import Grid, in_chunks
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.grid.grid import Grid, corner_bits, in_chunks
 
 
 def followed(

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import TURN, sum_by
-from mpm_dolfinx.points.cutting import FACE_SIGNS, FACES, cross, domain_volumes, volumes
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, TURN, sum_by
+from mpm_dolfinx.points.cutting import cross, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
 

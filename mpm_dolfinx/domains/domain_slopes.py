@@ -27,9 +27,8 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import FACES, corner_bits, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.cutting import FACES, corner_bits
 from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
 
 

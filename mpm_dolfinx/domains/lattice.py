@@ -32,9 +32,8 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
-from mpm_dolfinx.grid.grid import Grid, among, in_chunks
+from mpm_dolfinx.grid.grid import FACES, Grid, among, in_chunks
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10

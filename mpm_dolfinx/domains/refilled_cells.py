@@ -11,18 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
-from mpm_dolfinx.grid.grid import Grid, ranges, sum_by
-from mpm_dolfinx.points.cutting import (
-    FACES,
-    corner_bits,
-    cut,
-    on_planes,
-    simplex_volumes,
-    sliced,
-    slices_in_cells,
-    vertices,
-    volumes,
-)
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, ranges, sum_by
+from mpm_dolfinx.points.cutting import cut, on_planes, simplex_volumes, sliced, slices_in_cells, vertices, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled

@@ -45,6 +45,25 @@ ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
 
+def corner_bits(dim: int) -> NDArray[np.int64]:
+    """Return the ends (2^d, d) of the corners of a box along each axis: 0 lower, 1 upper."""
+    return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
+
+
+def _faces(dim: int) -> NDArray[np.int64]:
+    """Return the indices (2d, 2^(d-1)) of the corners of a box's faces; face 2 a + e is at end e of axis a."""
+    bits = corner_bits(dim)
+    return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
+
+
+FACES = {d: _faces(d) for d in (2, 3)}
+"""Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
+FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
+"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
+ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
+"""Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
+
+
 def side(name: str, dim: int) -> tuple[int, int]:
     """Return (axis, end) of a side of a box, by name."""
     if not isinstance(name, str) or name not in SIDES[dim]:
@@ -476,7 +495,7 @@ class Grid:
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic indices (n, 2^d) of the nodes of cells."""
-        bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
+        bits = corner_bits(self.dim)
         index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
         return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
@@ -624,14 +643,14 @@ class Grid:
         Row s is the factor of the product of the offsets along all axes whose bit is set in s.  For unequal cells, the
         offsets are divided by the edge lengths, see `over_edges`.
         """
-        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        bits = corner_bits(self.dim)[:, None]
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
         """Convert coefficients (d, 2^d, cells) of `monomials` to offsets in m; for equal cells they are unchanged."""
         if self.even:
             return coefficients
-        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        bits = corner_bits(self.dim)[:, None]
         return coefficients / np.where(bits, self.sizes(cells), 1.0).prod(axis=2)
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, sum_by
 
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
@@ -52,25 +52,6 @@ class Pieces:
     # (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces
     # with symmetric sections
     second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-
-
-def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the ends (2^d, d) of the domain's corners along each axis: 0 lower, 1 upper."""
-    return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
-
-
-def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the indices (2d, 2^(d-1)) of the corners of a domain's faces; face 2 a + e is at end e of axis a."""
-    bits = corner_bits(dim)
-    return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
-
-
-FACES = {d: _faces(d) for d in (2, 3)}
-"""Indices (2d, 2^(d-1)) of the corners of a domain's faces."""
-FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
-ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
 
 @cache

@@ -95,7 +95,7 @@ class MaterialPoints:
     id : (n,)
         Identifier of the point, unique in a scene.
     corners : (n, 2^d, d), m
-        Tracked corners of the particle domain, in the order of `cutting.corner_bits`.
+        Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
         Deformation gradient; in plane strain with an out-of-plane stretch only its in-plane part, scaled to det F.
     volume0 : (n,), m^d

@@ -15,9 +15,8 @@ from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, corner_bits
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import corner_bits
 
 
 @dataclass(frozen=True, eq=False)

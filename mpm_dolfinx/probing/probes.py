@@ -15,9 +15,8 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import all_of, flag, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import interpolate
-from mpm_dolfinx.grid.grid import in_chunks, rounding
+from mpm_dolfinx.grid.grid import corner_bits, in_chunks, rounding
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 

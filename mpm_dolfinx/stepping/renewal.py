@@ -35,10 +35,10 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.cutting import FACES, centroids, volumes
+from mpm_dolfinx.points.cutting import centroids, volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
 from mpm_dolfinx.stepping.state import State, Stay
 
