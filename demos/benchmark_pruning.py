@@ -172,6 +172,12 @@ def plastic(cells: int, law: type[mpm.Skeleton], **constants) -> mpm.Simulation:
     return block(cells, soil(law, friction=30.0, dilation=0.0, cohesion=1e9, **constants))
 
 
+def yielded(cells: int, **options) -> mpm.Simulation:
+    """Return the block of soil that yields, with the grid reset in each step."""
+    clay = soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD / 10)
+    return restless(cells, material=clay, numerics=mpm.Numerics(**options))
+
+
 def clayey(cells: int) -> mpm.Simulation:
     """Return the block of overconsolidated clay of the same bulk modulus, under its initial stress and a load."""
     p = 1e5  # Pa
@@ -254,6 +260,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         block,
         partial(plastic, law=mpm.DruckerPrager),
     ),
+    "kept volumes": (partial(yielded, keep_volumes=False), yielded),
     "Mohr-Coulomb instead of Drucker-Prager": (
         partial(plastic, law=mpm.DruckerPrager),
         partial(plastic, law=mpm.MohrCoulomb),

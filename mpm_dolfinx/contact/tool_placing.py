@@ -308,7 +308,7 @@ class Tools(Touching):
             held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
                 where = where if deep > NEAR else at_middle
-                raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
+                raise NotConverged(f"{line(tool)}: has passed through the surface, to {where}; renewal may help")
             if where := self._passed(tool, (before.x, points.x), (place.start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 

@@ -364,9 +364,9 @@ class RefilledCells:
         polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
-        large = Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece])
-        piece, quads = piece[large], quads[large]
-        edge = edge[large]
+        large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
+        large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # crumbs change no numbers
+        piece, quads, edge = (values[large] for values in (piece, quads, edge))
         left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
         corners[:, RING] = quads

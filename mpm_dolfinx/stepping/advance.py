@@ -72,7 +72,7 @@ class Motion:
         All bodies of the scene.
     momentum, storage
         Forms of the two balances, with u and p of a solved step; storage is None without fluid.
-    keep_volumes
+    keeps_volumes
         Whether yielded domains keep the volumes of their points, see `kept_volumes`.
     """
 
@@ -82,12 +82,10 @@ class Motion:
         bodies: Sequence[Body],
         momentum: MomentumForms,
         storage: StorageForms | None,
-        keep_volumes: bool,
+        keeps_volumes: bool,
     ):
-        self._keep_volumes = keep_volumes and materials.evolves
-        self._materials = materials
-        self._momentum = momentum
-        self._storage = storage
+        self.keeps_volumes, self._materials = keeps_volumes, materials
+        self._momentum, self._storage = momentum, storage
         self._trends = storage is None and momentum.elastic and not momentum.linear and momentum.inertia is None
         self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
@@ -150,8 +148,8 @@ class Motion:
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
-            if self._keep_volumes:
-                points = self._corrected(points, state, loads, keeps)
+            if self.keeps_volumes:
+                points = self._corrected(points, state, loads, keeps & stays)
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])

@@ -121,7 +121,8 @@ class Scene:
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
             of_fluid = (scene, weight, symmetric, feeding, inertial)
             self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
-        self.motion = Motion(scene, bodies, self.momentum, self.storage, self.numerics.keep_volumes)
+        keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
+        self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
         # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
         self._assembled: Latest[Assembled] = Latest()
