@@ -100,15 +100,8 @@ def cell_ratios(
     the drift.  Without mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded
     soil, because corner volumes are meaningless near plastic flow.
 
-    Parameters
-    ----------
-    cut, points
-        Cut particle domains, and points at the start of the step.
-    share : (n,)
-        Exponent of the ratio from corners in a geometric mean with the ratio of the point, in [0, 1]; 0 without mean
-        dilatation.
-    flows : (n,)
-        Whether points have yielded.
+    points: at the start of the step; share (n,): exponent of the ratio from corners in a geometric mean with the ratio
+    of the point, in [0, 1], 0 without mean dilatation; flows (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

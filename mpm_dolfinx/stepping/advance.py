@@ -216,10 +216,10 @@ class Motion:
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t, s, up to a constant.
 
-        The result is None without gravity, or if no fluid can flow. nodal (nodes, d), m: displacement since the cut.
+        The result is None without gravity. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None or self._storage.fluxes.flux is None:
+        if gravity is None:  # also if nothing conducts: a distant body that conducts must not change pressures
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight

@@ -259,7 +259,7 @@ class OnGrid(Keyed):
         storage of the pieces; in cells without storage the volume. t: time, s, of the pressures on drained sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
-        hydrostatic pressures `at_rest`, if fluid can flow.
+        hydrostatic pressures `at_rest`, if there is gravity.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -310,7 +310,7 @@ class OnGrid(Keyed):
         The reconstruction acts on differences from hydrostatic pressures, which cause no flow through sealed sides. In
         axisymmetry centroids and mean refer to the sections.
 
-        t: time, s, of the pressures on drained sides; at_rest: function for hydrostatic pressures, None without flow.
+        t: time, s, of the pressures on drained sides; at_rest: function for hydrostatic pressures, or None.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
