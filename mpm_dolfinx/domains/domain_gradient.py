@@ -100,15 +100,8 @@ def cell_ratios(
     mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
     volumes are meaningless near plastic flow.
 
-    Parameters
-    ----------
-    cut, points
-        Cut particle domains, and points at the start of the step.
-    share : (n,)
-        Weight, in [0, 1], of the ratio from corners in its geometric mean with the ratio of the point; 0 without mean
-        dilatation.
-    flows : (n,)
-        Whether points have yielded.
+    points: at the start of the step; share (n,): weight, in [0, 1], of the ratio from corners in its geometric mean with the
+    ratio of the point, 0 without mean dilatation; flows (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

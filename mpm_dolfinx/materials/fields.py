@@ -416,16 +416,16 @@ class SceneMaterials:
         empty = 1 - self.saturation(points, points.pressure)[0]
         return density - empty * self.porosity(points) * self.fluid.density
 
-    def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def confined_modulus(self, points: MaterialPoints, most: float = STIFFEST) -> NDArray[np.float64]:
         """Return the undrained confined modulus (n,), Pa: lambda + 2G + alpha^2 / S.
 
-        alpha^2 / S is limited to `STIFFEST` (lambda + 2G).
+        alpha^2 / S is limited to `most` (lambda + 2G).
         """
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
             return modulus
         fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), TINY)
-        return modulus + np.minimum(fluid, STIFFEST * modulus)
+        return modulus + np.minimum(fluid, most * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the state at the points (n, ...)."""

@@ -225,7 +225,7 @@ class Motion:
         The result is None without gravity. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None:
+        if gravity is None:  # also if nothing conducts: a distant body that conducts must not change pressures
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight

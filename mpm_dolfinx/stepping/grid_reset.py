@@ -260,7 +260,7 @@ class OnGrid(Keyed):
         the pieces' storage; in cells without storage their volume. t: time, s, of the pressures on drained sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
-        hydrostatic pressures `at_rest`.
+        hydrostatic pressures `at_rest`, if there is gravity.
         """
         pieces = self.data.pieces
         contents = self.contents
