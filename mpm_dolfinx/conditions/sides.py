@@ -59,10 +59,10 @@ class Sides:
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
         """Return the faces of a prescribed displacement, without cells that the region covers by at most one half.
 
-        The last prescribed node also moves half a cell outside the region.  If the region covers at most half of its
-        last cell, the faces therefore end at the inner side of this cell.  On a side inclined to the grid, they end
-        half a cell before the end of the region.  This applies only where the side continues outside the region and no
-        other condition prescribes the same components there.
+        The last prescribed node also moves half a cell of the side outside the region.  If the region covers at most
+        half of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side
+        inclined to the grid, the faces end half a cell before the end of the region.  Both apply only where the side
+        continues outside the region and no other condition prescribes the same components there.
 
         Parameters
         ----------

@@ -90,7 +90,8 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(comm, ConditionWarning, f"{what}: at one level, the two are not in equilibrium", name, weight, of, own)
+            what = f"{what}: at equal levels, these waters are not in equilibrium"
+            warn(comm, ConditionWarning, what, name, weight, of, own)
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:

@@ -128,7 +128,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed, due to points that have not flowed, several bodies or conditions."""
+        """Return which cells are not renewed: with points that have not flowed, several bodies, or other conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)

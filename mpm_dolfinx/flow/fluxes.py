@@ -3,8 +3,8 @@
 
 The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
 fluxes through the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the
-material in a cell, the cell's mobility kappa becomes J F^-1 kappa F^-T.  `drained_sides` computes fluxes through open
-sides; `StorageProblem` in `storage` adds up both kinds of fluxes.
+material in a cell, and J = det F, the cell's mobility kappa (conductivity / unit weight) becomes J F^-1 kappa F^-T.
+`drained_sides` computes fluxes through open sides; `StorageProblem` in `storage` adds up both kinds of fluxes.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ class CellContents(Keyed):
     Parameters
     ----------
     forms
-        Forms whose coefficients are set.
+        Forms; this class sets their coefficients.
     pieces
         Contributions of the pieces.
     filled
@@ -262,7 +262,8 @@ class CellContents(Keyed):
     ) -> NDArray[np.float64]:
         """Set the strength tau of the damping of elastic soil in the filled cells; return tau (n,), 1/Pa.
 
-        `share` (n,) multiplies tau.  `less` (n,), 1/Pa, is the storage by saturation, which is subtracted.
+        `share` (n,) multiplies tau.  `less` (n,), 1/Pa, is the storage due to changes of saturation, which is
+        subtracted.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values

@@ -231,9 +231,9 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the tool, and the cells around them widen or narrow.  A function of time t (s), of the positions x (n, d) of all
-        points, or of both returns the same number of lines between the same sides.  A tool must be a condition of the
-        first stage; lines do not move in stages without the tool.
+        the tool, and the cells around them widen or narrow.  The tool must be a condition of the first stage; lines do
+        not move in stages without it.  A function depends on time t (s), the positions x (n, d) of all points, or both.
+        It returns all lines: as many along each axis as `lines`, with the same first and last coordinate.
     axisymmetric
         Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
         forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"

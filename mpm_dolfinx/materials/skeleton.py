@@ -366,8 +366,8 @@ def _deviatoric(F):
 def _stretch_difference(C):
     """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
-    The eigenvalues divided by their mean are 1 + radius and 1 - radius.  This formula has one quotient; second
-    derivatives of C / mean would have twice as many.
+    The eigenvalues divided by their mean are 1 + radius and 1 - radius.  The formula has one quotient, `ratio`.  If C
+    were divided by its mean first, the second derivatives would contain twice as many quotients.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
@@ -451,7 +451,7 @@ class unsaturated:
     Parameters
     ----------
     suction
-        Suction, Pa, > 0: 0.5 to 1 times the unit weight of water times the cell height.
+        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times (unit weight of water) (cell height).
     least
         Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
     specific_yield

@@ -33,13 +33,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides of the bodies, in a stage.
-
-    Parameters
-    ----------
-    setting, loads
-        The stage, and its loads by name.
-    """
+    """Loads of one kind on sides of the bodies in a stage, `setting`; loads: by name."""
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms

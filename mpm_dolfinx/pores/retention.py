@@ -6,7 +6,8 @@ the relative permeability k_r as functions of p,
 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
-(Richards 1931; Bishop 1959).  By default chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
+with the porosity n, the saturated conductivity k and Biot's coefficient alpha (Richards 1931; Bishop 1959).  By default
+chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
 
 A user-defined curve is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  It may have
 `bishop(p)`, which returns chi; by default chi = S.  Constants of laws derived from `Retention` are not compiled.

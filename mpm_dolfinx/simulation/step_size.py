@@ -48,7 +48,7 @@ AGAIN = 2.0
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
-"""Smallest `rtol` / solver tolerance; with a smaller `rtol` solver errors would hide the error of the step."""
+"""Smallest ratio of `rtol` to the solver tolerance; below it, solver errors would hide the error of the step."""
 FIRST = 1e-3
 """Smallest first adaptive step, relative to the first output interval."""
 
