@@ -48,14 +48,7 @@ MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 class FormsOf:
     """Compiled forms of the conditions of a scene.  Each kind of form is compiled at the first use.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    u
-        Displacement increment of the step, m.
-    velocity
-        Velocity of the bodies in a substep.
+    grid: background grid; u: displacement increment of the step, m; velocity: velocity of the bodies in a substep.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):

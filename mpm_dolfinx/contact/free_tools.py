@@ -57,15 +57,9 @@ class MotionEquation(NamedTuple):
 class FreeTools(ContactProblem):
     """Base class that adds the motion of free tools to `ToolLoads`.
 
-    Parameters
-    ----------
-    placed
-        Arguments of `ToolLoads`.
-    mass, guides
-        `mass`: masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  `guides`:
-        projections (k, q, q) on the motions that each tool can perform, see `motion_count`.
-    velocity, pushes
-        `velocity`: velocities (k, q), m/s and rad/s, at the start of the step.  `pushes`: loads (k, q), N and N m.
+    placed: arguments of `ToolLoads`; mass (k, q): masses, kg, and moments of inertia, kg m^2, 0 for tools that are not
+    free; guides (k, q, q): projections on the motions that each tool can perform, see `motion_count`; velocity (k, q):
+    velocities at the start of the step, m/s and rad/s; pushes (k, q): loads, N and N m.
     """
 
     couples = True

@@ -91,12 +91,7 @@ class Touch:
 class ContactLaw:
     """Contact pressures, shear tractions and their derivatives in a substep.
 
-    Parameters
-    ----------
-    names, contacts
-        Names of the contacts, and the contacts.
-    pairs
-        Possible contact pairs.
+    names: names of the `contacts`; pairs: possible contact pairs.
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):

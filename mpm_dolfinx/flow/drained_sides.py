@@ -252,14 +252,8 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    Parameters
-    ----------
-    sides
-        Faces of the open sides.
-    wet
-        Data of the substep.
-    names, ponds
-        Names of the conditions, and largest pond depths, m, or None without rain; in the order of `OpenSides.number`.
+    sides: faces of the open sides; wet: data of the substep; names: names of the conditions; ponds: largest pond
+    depths, m, or None without rain.  Both have the order of `OpenSides.number`.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):

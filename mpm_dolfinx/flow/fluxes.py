@@ -158,12 +158,7 @@ class OpenSides:
 
         The values are nan where there is no drained side.
 
-        Parameters
-        ----------
-        at : (m,)
-            Index of the cell of each face among the filled cells.
-        p : (n,), Pa
-            Pressures of the filled cells.
+        at (m,): index of the cell of each face among the filled cells; p (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.einsum("md,md->m", self.offset, self.normal)
@@ -205,14 +200,7 @@ class PieceContents:
 class CellContents(Keyed):
     """Material in the cells, as of the last grid reset.  Arrays over local cells are valid in active cells.
 
-    Parameters
-    ----------
-    forms
-        Forms; this class sets their coefficients.
-    pieces
-        Contributions of the pieces.
-    filled
-        Owned active cells.
+    forms: forms; this class sets their coefficients.  pieces: contributions of the pieces; filled: owned active cells.
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):

@@ -164,12 +164,9 @@ class MixedCells:
     ) -> Paths:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
-        Parameters
-        ----------
-        kappa, law
-            Mobilities (m,), m^2/(Pa s), of all pieces at saturation, and indices of their retention curves, < `laws`.
-        shift
-            Vectors (n, d), m, from the centroids of filled cells to their pressure positions; None if all are zero.
+        kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation; law (m,): indices of their retention curves,
+        below `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
+        all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)

@@ -131,14 +131,8 @@ class Gradients:
     ) -> NDArray[np.float64]:
         """Return the gradients (rows, d), Pa/m: pressure gradient minus unit weight of the fluid.
 
-        Parameters
-        ----------
-        p : (c,), Pa
-            Pressures of all local cells.
-        outer : (m,), Pa
-            Pressures outside the open sides.
-        weight : (d,), N/m^3
-            Unit weight of the fluid; None without gravity.
+        p (c,), Pa: pressures of all local cells; outer (m,), Pa: pressures outside the open sides; weight (d,), N/m^3:
+        unit weight of the fluid; None without gravity.
         """
         of_cells, of_sides = self._units
         own, at = p[self._own], self._at[self._known]

@@ -94,12 +94,7 @@ def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
 class ElementForces:
     """The linear form T : grad v of Q1 vectors, integrated over points by summation in each cell.
 
-    Parameters
-    ----------
-    stress : UFL tensor (d, d)
-        Components T[i, k] at the points.
-    points
-        Points of the forms.
+    stress (d, d): UFL tensor T[i, k] at the points; points: points of the forms.
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):

@@ -467,12 +467,8 @@ class Grid:
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
 
-        Parameters
-        ----------
-        load : (cells,)
-            Load of each cell, such as its number of points, >= 0.
-        keep
-            Whether to keep an existing mesh for any distribution, because other objects were created on this mesh.
+        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
+        any distribution, because other objects were created on this mesh.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -690,12 +686,8 @@ class GridOfGroups(Grid):
     The mesh consists of disconnected boxes at the same position.  The same process owns corresponding cells of all
     copies.
 
-    Parameters
-    ----------
-    grid
-        Grid of the bodies.
-    group : (points,)
-        Group of each material point of the scene, in the order of ids, counted from 0.
+    grid: grid of the bodies; group (points,): group of each material point of the scene, in the order of ids, counted
+    from 0.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):

@@ -227,10 +227,7 @@ class SoftnessAtPoints:
     At rest the strain is rounding, and its direction is random.  G_t is therefore a weighted mean: the modulus of the
     step has the weight e : e, the modulus before the step the weight `NEAR`^4.  A step at rest thus changes nothing.
 
-    Parameters
-    ----------
-    grid, law, shapes, stretches
-        See `LawAtPoints`.
+    grid, law, shapes, stretches: see `LawAtPoints`.
     """
 
     def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], stretches: int):

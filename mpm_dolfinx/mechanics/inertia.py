@@ -156,10 +156,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
     A rigid rotation then causes no strain in any body. P F^T is symmetric, so moments balance.
 
-    Parameters
-    ----------
-    G : (n, d, d)
-        Gradient of the displacement since the start of the step.
+    G (n, d, d): gradient of the displacement since the start of the step.
     """
     one = np.eye(G.shape[1])
     delta = one + G
@@ -170,14 +167,8 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
 
-    Parameters
-    ----------
-    points
-        All integration points.
-    of_laws
-        The integration points of each law.
-    u
-        Displacement increment of the step, m.
+    points: all integration points; of_laws: the integration points of each law; u: displacement increment of the step,
+    m.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -314,14 +305,9 @@ class Mass:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data `VELOCITY` and `RATE`, velocities and rates of F, after a step.
 
-        Parameters
-        ----------
-        points
-            Material points at the start of the step.
-        velocities
-            Velocities of the unknowns at the start and the end of the step, m/s.
-        moved : (n,)
-            Largest displacement of a corner, in cell sizes, in the connected part of the point; 0 if its cut is kept.
+        points: material points at the start of the step; velocities: velocities of the unknowns at the start and the
+        end of the step, m/s; moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the
+        point; 0 if its cut is kept.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -369,14 +355,8 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    Parameters
-    ----------
-    mass
-        Mass of the bodies on the grid.
-    flight
-        Inertial predictor: displacement without forces, from the velocities alone, m.
-    rate
-        1 / g^2, 1/s^2, with the weight g, s, of the substep's own rate.
+    mass: mass of the bodies on the grid; flight, m: inertial predictor, the displacement without forces; rate, 1/s^2: 1
+    / g^2, with the weight g, s, of the substep's own rate.
     """
 
     holding = True

@@ -53,12 +53,7 @@ class SumsOfPart(NamedTuple):
 class FBar:
     """F-bar modification of laws, with the volume ratio theta of the step in each cell and its mean stress pi.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    symmetric
-        Whether the tangents of all laws are symmetric.
+    grid: background grid; symmetric: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -174,12 +169,8 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
-    Parameters
-    ----------
-    fbar
-        The fields theta and pi.
-    parts
-        Sums of the parts in which cells would lock, by index of the part, see `QuadratureData`.
+    fbar: the fields theta and pi; parts: sums of the parts in which cells would lock, by index of the part, see
+    `QuadratureData`.
     """
 
     def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):
@@ -265,12 +256,7 @@ def _dev(tau, F):
 class StressAtPoints:
     """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
 
-    Parameters
-    ----------
-    P, slope
-        UFL expressions at the points: (d, d) and scalar.
-    points
-        Integration points of the part.
+    P (d, d), slope: the stress and its derivative, as UFL; points: integration points of the part.
     """
 
     def __init__(self, P, slope, points: FormPoints):

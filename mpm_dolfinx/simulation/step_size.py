@@ -245,7 +245,7 @@ class Times:
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time for pressure diffusion through a cell, h^2 / c_v, s; 0 without conductivity."""
+    """Return the least (cell size)^2 / (coefficient of consolidation), s, of all points; 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)

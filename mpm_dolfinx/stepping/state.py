@@ -106,9 +106,7 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float) -> NDArray[np.float64]:
-        """Return changes (n, d, 1 + d) of x, m, and F in a time (s), extrapolated by a parabola through the last
-        states.
-        """
+        """Return changes (n, d, 1 + d) of x, m, and F in a time, s: extrapolated parabola through the last states."""
         rate = self.rates[:, 0]
         if len(self.lengths) > 1:
             rate = rate + (seconds + self.lengths[0]) / self.lengths.sum() * (rate - self.rates[:, 1])
