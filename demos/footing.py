@@ -306,9 +306,9 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with the viscosity `viscosity` c t, where t = `seconds` is the duration of the push.
+    """Return the soil with a viscosity, Pa s: (`viscosity`) (cohesion) (duration `seconds` of the push).
 
-    A shear strain of 1 in this duration then increases the shear stress by `viscosity` c.
+    A shear strain of 1 in this duration then increases the shear stress by `viscosity` times the cohesion.
     """
     if viscosity == 0:
         return SOIL

@@ -198,7 +198,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Reduce the cohesion to its value at the end of the next step."""
+        """Set the cohesion to the value prescribed for the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 

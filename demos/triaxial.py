@@ -69,7 +69,8 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
     """Return the processor time of a step of each law, divided by that of Drucker and Prager's law.
 
-    Steps of the laws alternate.  Sands have associated flow, because otherwise shear bands form in the block.
+    The laws are timed in turn, one step each, so that a varying load of the machine affects all alike.  Sands have
+    associated flow, because otherwise shear bands form in the block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}

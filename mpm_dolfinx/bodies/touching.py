@@ -269,14 +269,8 @@ def uncovered(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the rectangles of faces that no box covers: for each its face (m,), lower and upper corner (m, 2).
 
-    Parameters
-    ----------
-    count
-        Number of faces.
-    face, low, high : (n,), (n, 2), (n, 2)
-        Faces, and the boxes that cover parts of them, in face coordinates from 0 to 1.
-    slack : (n,)
-        Largest difference between the ends of boxes that count as equal.
+    count: number of faces; face (n,): faces; low, high (n, 2): corners of the boxes that cover parts of these faces, in
+    face coordinates from 0 to 1; slack (n,): largest difference between the ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)

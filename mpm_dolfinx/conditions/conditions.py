@@ -129,9 +129,9 @@ class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
     The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
-    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; a few per cent of
-    oblique waves are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies with
-    weight need such a stage.
+    the normal and rho c_s in the tangent plane, with the density rho and the speeds c_p and c_s of compression and
+    shear waves.  Waves along the normal are absorbed completely; a few per cent of oblique waves are reflected.  A side
+    that was fixed in a stage without inertia keeps its tractions.  Bodies with weight need such a stage.
 
     Parameters
     ----------
@@ -430,13 +430,13 @@ class Displacement(Condition):
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement since the start, or since a stage reset it, at reference positions X (m, d).  For a mapped body,
-        the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
+        Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  For a mapped
+        body, the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell of
-        the side outside the box.  If the box covers at most half of its last cell, that cell's far node stays free.
+        Box of reference positions; faces inside it are prescribed.  Where the box ends within a cell, the cell's node
+        outside the box is prescribed if the box covers more than half of the cell, and free otherwise.
 
     Raises
     ------
@@ -475,7 +475,8 @@ class _OfPlate(Traction):
 class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies: all faces have the same displacement normal to the side.
 
-    A penalty on the slope of the faces, kappa/2 int (grad_t x_n)^2 dA, keeps the plate flat and prevents tilting.  The
+    A penalty kappa/2 int (grad_t x_n)^2 dA on the slope of the faces keeps the plate flat and prevents tilting.  x_n is
+    the position along the normal, grad_t the gradient along the side, and kappa the stiffness from `RIGIDITY`.  The
     penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters

@@ -94,10 +94,7 @@ class Neighbours:
 class LinearGradients:
     """Deformation gradients at the pieces of the domains in a scene.
 
-    Parameters
-    ----------
-    comm, bodies
-        Communicator of the processes, and all bodies of the scene.
+    comm: communicator of the processes; bodies: all bodies of the scene.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):

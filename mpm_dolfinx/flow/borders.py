@@ -77,14 +77,9 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        Parameters
-        ----------
-        laws
-            Relative conductivities as functions of pressure, see `Laws`.
-        contents, flow
-            Material in the cells, and conductivities of the filled owned cells.
-        places, moved
-            Vectors (c, d), m, for local cells: from midpoint to pressure position; displacement in the step.
+        laws: relative conductivities as functions of pressure, see `Laws`; contents: material in the cells; flow:
+        conductivities of the filled owned cells; places (c, d), m: vectors from the midpoints of local cells to their
+        pressure positions; moved (c, d), m: displacements of the cells in the step.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1

@@ -6,11 +6,11 @@ harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exa
 the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
 conductivity blocks all lines of some cell, and a drain contains complete lines.
 
-The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  The
-resistance from there to the lower end is int (1 - s) dR, to the upper end int s dR, with s in [0, 1] along the line.
-The sum of these resistances is exact for lines through several cells.  For layers inclined by more than `INCLINED` the
-position moves to the more conductive end.  Otherwise a drain would be interrupted between rows of cells.  The shape of
-a piece is approximated by the bounding box of its domain in the cell.
+The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  With
+the resistance R of the line, and s from 0 to 1 along the line, the resistance from this position to the lower end is
+int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through several cells.  For
+layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a drain would be
+interrupted between rows of cells.  The shape of a piece is approximated by the bounding box of its domain in the cell.
 
 A conductivity that depends on deformation varies even in cells without layers, see `graded`.
 """
@@ -164,12 +164,9 @@ class MixedCells:
     ) -> Paths:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
-        Parameters
-        ----------
-        kappa, law
-            Mobilities (m,), m^2/(Pa s), of all pieces at saturation, and indices of their retention curves, < `laws`.
-        shift
-            Vectors (n, d), m, from the centroids of filled cells to their pressure positions; None if all are zero.
+        kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation; law (m,): indices of their retention curves,
+        below `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
+        all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)

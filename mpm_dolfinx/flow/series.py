@@ -7,8 +7,8 @@ conducts like a pair of cells that contain only this soil (`fitted`).  Steady fl
 therefore exact at any offset from the grid.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  Its soils follow in the order along the lines, each with its mean
-fraction of the length.
+cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over the
+mean of its fractions of the replaced lines.
 """
 
 from __future__ import annotations

@@ -186,10 +186,10 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) along normals (m, d), between pressures p of owned cells and outside pressures (m,), Pa.
+        """Return k_r between cells and sides, and the derivative of k_r (p - outer + drop) by p, both (m,).
 
-        Also return the derivative by p of k_r times the potential difference.  `drop` (m,), Pa, is the pressure drop
-        from the centroid to the face caused by the weight of the fluid.
+        Pressures (m,), Pa: p in owned cells, `outer` outside, and `drop`, the drop from the centroid to the face that
+        the weight of the fluid causes.  `normal` (m, d): normals of the sides.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

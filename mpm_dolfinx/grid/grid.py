@@ -231,9 +231,9 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the tool, and the cells around them widen or narrow.  A function of time t (s), of the positions x (n, d) of all
-        points, or of both returns the same number of lines between the same sides.  A tool must be a condition of the
-        first stage; lines do not move in stages without the tool.
+        the tool, and the cells around them widen or narrow.  The tool must be a condition of the first stage; lines do
+        not move in stages without it.  A function depends on time t (s), the positions x (n, d) of all points, or both.
+        It returns all lines: as many along each axis as `lines`, with the same first and last coordinate.
     axisymmetric
         Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
         forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
@@ -467,12 +467,8 @@ class Grid:
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
 
-        Parameters
-        ----------
-        load : (cells,)
-            Load of each cell, such as its number of points, >= 0.
-        keep
-            Whether to keep an existing mesh for any distribution, because other objects were created on this mesh.
+        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
+        any distribution, because other objects were created on this mesh.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -690,12 +686,8 @@ class GridOfGroups(Grid):
     The mesh consists of disconnected boxes at the same position.  The same process owns corresponding cells of all
     copies.
 
-    Parameters
-    ----------
-    grid
-        Grid of the bodies.
-    group : (points,)
-        Group of each material point of the scene, in the order of ids, counted from 0.
+    grid: grid of the bodies; group (points,): group of each material point of the scene, in the order of ids, counted
+    from 0.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):

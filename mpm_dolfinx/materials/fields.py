@@ -39,8 +39,9 @@ changes the result of scene "soil" in tests/plateaus.py by 6.6e-05 (relative), d
 by 3.0e-02.
 """
 STIFFEST = 100.0
-"""Upper limit of (alpha^2 / S) / (lambda + 2G), which limits rounding errors.  Halving this value changes the result of
-scene "soil" in tests/plateaus.py by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
+"""Upper limit of (alpha^2 / S) / (lambda + 2G), the stiffness of the pore fluid relative to the skeleton's (S: storage
+coefficient), which limits rounding errors.  Halving this value changes the result of scene "soil" in tests/plateaus.py
+by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
 """
 
 

@@ -2,7 +2,7 @@
 """Prescribed displacements of sides, by penalties on the mean in each cell and weaker ones at points; see `held_cells`.
 
 If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
-multipliers (Hestenes 1969).  With multipliers the means are exact against any resistance of the body.
+multipliers (Hestenes 1969).  With multipliers the means are exact, whatever the resistance of the body.
 """
 
 from __future__ import annotations
@@ -352,7 +352,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled dofs (n,), and penalty forces (n,), N, on them that do not count as reactions of walls."""
+        """See `Loads`: penalty forces on walls."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

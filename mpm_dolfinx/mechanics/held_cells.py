@@ -70,9 +70,10 @@ def inner_cells(
 ) -> NDArray[np.int64]:
     """Return the local cells (n,) whose constraints contain the points of sides.
 
-    A flat side on a grid line is slightly wavy, so some of its cells are nearly empty.  Their constraints would
-    contradict those of inner cells: only a large motion of nodes beyond the line, which nothing resists, could satisfy
-    both.  The inner cell therefore takes these points too (aggregation; Badia, Verdugo and Martin 2018).
+    After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
+    beyond the line.  Constraints there would contradict those of inner cells: only a large motion of nodes beyond the
+    line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain these points
+    too (aggregation; Badia, Verdugo and Martin 2018).
 
     fill (cells,): volume fraction; sides: for each condition its prescribed components, and the extent (d,), m, of its
     prescribed positions.  For each point: index of its condition, `number` (n,); its owned `cell` (n,); its outward

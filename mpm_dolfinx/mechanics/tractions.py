@@ -33,13 +33,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides of the bodies, in a stage.
-
-    Parameters
-    ----------
-    setting, loads
-        The stage, and its loads by name.
-    """
+    """Loads of one kind on sides of the bodies in a stage, `setting`; loads: by name."""
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms
@@ -182,12 +176,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
     A surface counts as open if corners of its faces lie on the edges of other faces.
 
-    Parameters
-    ----------
-    free : (nodes, d)
-        Which displacement components walls leave free.
-    pressures
-        Pressures and their faces.
+    free (nodes, d): which displacement components walls leave free; pressures: pressures and their faces.
     """
     if not pressures:
         return True

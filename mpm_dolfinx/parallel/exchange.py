@@ -35,12 +35,7 @@ traffic = Traffic()
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
-    Parameters
-    ----------
-    comm
-        Processes of the exchange.
-    destination : (n,)
-        Rank of the process that receives each row.
+    comm: processes of the exchange; destination (n,): rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):

@@ -38,14 +38,7 @@ class Parts:
 class OfParts:
     """Entries of a distributed vector on this process, with the connected part of each entry.
 
-    Parameters
-    ----------
-    comm
-        The processes.
-    of : (n,)
-        Part of each entry.
-    count
-        Number of parts.
+    comm: the processes; of (n,): part of each entry; count: number of parts.
     """
 
     comm: MPI.Comm

@@ -36,7 +36,8 @@ class CellFields:
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Volume that the pore fluid would have at zero pressure, minus the points' volume defect; None without fluid.
+        Pore fluid, as a volume at zero pressure: the content from porosity and pressure, minus its excess `owed` over
+        the true content (see `flow.storage`); None without fluid.
     """
 
     cell: NDArray[np.int64]

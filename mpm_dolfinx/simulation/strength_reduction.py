@@ -55,9 +55,9 @@ By the end the overload has halved. With values of 1/8 and 1/2 the slope's facto
 STRAINS = 4.0
 """Strain in a trial of a marginal slide, divided by the smaller of its overload and the elastic strain at yield.
 
-Stresses of soil that begins to flow redistribute within a few strains at yield.  In soft soil such strains would change
-the shape of the body, so the viscosity is larger there.  If this number is halved or doubled, the factor of a slope
-changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
+Stresses of soil that begins to flow redistribute within strains of a few times that at yield.  In soft soil such large
+strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
+factor of a slope changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")

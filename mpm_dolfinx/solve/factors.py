@@ -46,12 +46,8 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve, and after changes of A; if `symmetric`, as L D L^T.
 
-    Parameters
-    ----------
-    gathered
-        Whether one process, the last one, holds the factors; this suits many solves with the same matrix.
-    package
-        Package of the factorisation; None: PETSc on one process, MUMPS on several.
+    gathered: whether one process, the last one, holds the factors; this suits many solves with the same matrix.
+    package: package of the factorisation; None: PETSc on one process, MUMPS on several.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -222,12 +218,8 @@ class SingleFactors:
 class NodalFactors:
     """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
-    Parameters
-    ----------
-    unknowns
-        Unknown displacements; components of a node are consecutive.
-    symmetric
-        Whether the factors are U^T D U; else L U.
+    unknowns: unknown displacements; components of a node are consecutive. symmetric: whether the factors are U^T D U;
+    else L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):

@@ -5,8 +5,8 @@ Without yield the step is full, even if the residual grows, because rotations of
 at first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
 In yielding soil the step is full if the residual falls, or if the residual forces at its end do less than half of the
-initial work along it. Otherwise the search ends where this work is about zero (Matthies and Strang 1979). There soil
-that unloads is elastic, also in the next tangent. The work includes that of the fluid's residual, because
+initial work along it. Otherwise the search ends where this work is about zero (Matthies and Strang 1979). At that step
+length, soil that unloads is elastic, also in the next tangent. The work includes that of the fluid's residual, because
 the forces' work alone nearly vanishes if only the fluid is out of balance. Shorter steps with smaller residuals would
 lead to more short steps. Bracketed secants find the zero. Soil that has lost its strength needs several secants: with
 one secant, a slumping bank takes twice the Newton steps.

@@ -58,7 +58,7 @@ class OnGrid(Keyed):
     cut
         The cut particle domains.
     of_fluid
-        Whether beta is 1/K_w, see `Scheme`.
+        Whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
     """
 
     def __init__(

@@ -49,10 +49,7 @@ LONGEST = 1.0
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    Parameters
-    ----------
-    bodies, materials
-        Bodies and materials of the scene.
+    bodies, materials: bodies and materials of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body], materials: SceneMaterials):

@@ -135,11 +135,11 @@ class Result:
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        kinetic and elastic belong to the bodies and free tools; elastic is 0 for laws without an energy. Others are the
-        work since the start of the run: external of all loads; viscous on quiet sides and by user-defined terms;
-        friction of slip at tools and between groups; internal of the stresses. dissipated is internal minus elastic,
-        in wet bodies with the work of flow and storage of water. kinetic + elastic + dissipated + viscous + friction -
-        external is constant, up to losses of the method.
+        `kinetic` and `elastic` are energies of the bodies and free tools; `elastic` is 0 for laws without an energy.
+        Works since the start of the run: `external`, of all loads; `viscous`, on quiet sides and of user-defined terms;
+        `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
+        `elastic`, in wet bodies with the work of flow and storage of water. `kinetic` + `elastic` + `dissipated` +
+        `viscous` + `friction` - `external` is constant, up to losses of the method.
         """
         return self.outcome("energy")
 

@@ -265,7 +265,7 @@ class SelfWeightColumn:
         return lambertw(-self.stress(Y) / (self.bulk + 4 / 3 * self.shear)).real
 
     def stress(self, Y: ArrayLike) -> Array:
-        """Return the vertical Cauchy stress (...), Pa, at heights Y (...), m, in [0, l0]. Source: the weight above."""
+        """Return the vertical Cauchy stress (...), Pa, at heights Y (...), m, in [0, l0]; it bears the weight above."""
         return -self.density * self.gravity * (self.l0 - _within("Y", Y, self.l0))
 
     def stretch(self, Y: ArrayLike) -> Array:
