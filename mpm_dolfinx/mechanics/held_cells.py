@@ -94,7 +94,7 @@ def inner_cells(
 
 
 class HeldCells:
-    """Penalties of prescribed displacements: those on means, one for each condition and cell, then those at points.
+    """Penalties of prescribed displacements: first on means, one for each condition and cell, then at points.
 
     Parameters
     ----------
