@@ -72,5 +72,5 @@ def test_the_last_digit_of_coordinates_does_not_decide_how_many_rows_a_box_has()
         for cells in (0, 4, 10000, -30000):
             grid = mpm.Grid([cells * h] * 2, [(7 + cells) * h] * 2, [7, 7])
             lower = np.array([0.7 + cells, 0.0 + cells]) * h
-            found.append(len(mpm.box(grid, lower, lower + [5.5 * h, h], per_cell=per_cell)))
+            found.append(len(mpm.box(grid, lower, lower + np.array([5.5, 1.0]) * h, per_cell=per_cell)))
         assert found == [rows * per_cell] * 4, found

@@ -174,6 +174,29 @@ def test_soil_that_could_yield_and_does_not_is_damped_as_elastic_soil(monkeypatc
     assert other == pytest.approx(one, rel=1e-5) and np.abs(p - plain).max() < 1e-4 * np.abs(plain).max()
 
 
+def pressed(times):
+    """Return the softness after each step, and the final positions, of sealed sand that yields under two loads."""
+    grid = mpm.Grid([0, 0], [0.4, 0.5], [4, 5])
+    sand = mpm.DruckerPrager(1e7, 1e7, friction=20.0, dilation=0.0, cohesion=1e2, conductivity=0.0)
+    first = mpm.Traction("top", lambda t: (0, -2e4 * np.interp(t, [0, *times], [0, 1, 1, 1])))
+    then = mpm.Traction("top", lambda t: (0, -2e4 * np.interp(t, [0, *times], [0, 0, 0, 1])), region=((0, 0), (0.2, 1)))
+    body, softness = [mpm.box(grid, [0, 0], [0.4, 0.4])], []
+    options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [first, then]}
+    s = mpm.Simulation(grid, body, [sand], fluid=mpm.Fluid(bulk=1e6), **options)
+    s.run(times[-1], 1.0, observe=lambda s: softness.append(s.points.data["softness"]), progress=False)
+    return softness, s.points.x
+
+
+def test_a_step_at_rest_changes_nothing():
+    """Its strain is rounding, whose direction would make soil on its yield surface stiff or a hundred times as soft."""
+    (flows, rests, last), x = pressed([1, 2, 3])
+    (first, alone), y = pressed([1, 1, 2])
+    assert 2 < flows.min() and flows.max() < 50
+    assert rests == pytest.approx(flows, rel=1e-6) and first == pytest.approx(flows)
+    assert alone == pytest.approx(last, rel=1e-5)
+    np.testing.assert_allclose(x, y, rtol=0, atol=1e-11)
+
+
 def test_only_points_in_water_of_laws_with_a_state_carry_their_softness():
     grid, walls = mpm.Grid([0, 0], [0.2, 0.4], [2, 4]), {"left": "x", "right": "x", "bottom": "y"}
     sand = mpm.DruckerPrager(1e7, 5e6, friction=0.0, dilation=0.0, cohesion=1e3)

@@ -39,13 +39,13 @@ class Origin:
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
-    number: NDArray[np.int64]  # number of the contact (n,)
+    number: NDArray[np.int64]  # index of the contact (n,)
     area: NDArray[np.float64]  # contact area (n,), m^(d-1)
 
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with means of pressures `push` (m,) and tractions `shear` (m, d), Pa, of their pairs."""
+        """Return the points with means, over the pairs of each, of pressures `push` (m,) and tractions `shear`, Pa."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)

@@ -7,8 +7,8 @@ At a position with gap g, the contact pressure and its energy per area are
 
 The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier lambda has one value for each
 contact and cell, which starts from the pressure of the previous step.  Augmentation (Uzawa's method) updates lambda
-until the mean penetration in each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step,
-and on the shear traction t_n of the points after the previous step,
+until the mean penetration in each cell is below `DEPTH`.  Friction depends on means over the pairs in a cell: the slip
+s in the step, and the shear traction t_n after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
@@ -17,7 +17,7 @@ with the projection P on the tangent plane.  Sticking contact is elastic with st
 The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
 cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
 traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
-that opens slips afterwards; if it had returned from slip to stick before, it slips for good.  Otherwise shear alone
+that opens is set to slip; if it had returned from slip to stick before, it never sticks again.  Otherwise shear alone
 could open and close the contact under a round tool at first contact, where the mean normal is inclined.
 """
 
@@ -42,7 +42,7 @@ STIFF = 100.0
 """Stiffness k in units of (resistance) / (cell size)."""
 GRIP = 6.0
 """Stiffness k_t in units of (resistance) / (cell size).  A larger k_t allows shears that cancel at the nodes."""
-DEPTH = 5e-4  # cells: allowed mean penetration
+DEPTH = 5e-4  # allowed mean penetration / cell size
 SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
@@ -53,7 +53,7 @@ RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State of the contact iterations, without displacements.  Each contact has one condition per cell, k in all."""
+    """State of the contact iterations, without displacements.  There are k conditions: one per contact and cell."""
 
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
@@ -103,7 +103,7 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Contact and cell of each condition (k,), combined in one number."""
+        """Key of each condition (k,): (index of the contact) * (number of local cells) + local cell."""
         self.cell = key % self.grid.num_local
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
@@ -139,7 +139,7 @@ class ContactLaw:
         """Return forces and derivatives for pairs with a geometry `at`."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        # only rounding: light bodies penetrate less than 1e-8 cells
+        # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
         rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         touches = (push > 0) | (at.gap <= rounding)
         pressure = self.mean(push)
@@ -157,7 +157,7 @@ class ContactLaw:
     ) -> tuple:
         """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        Means of the conditions (k, d): normals n, slips, m, and tractions before the step `old`, Pa.
+        Means over the pairs of each condition (k, d): normal `n`, `slip`, m, and traction before the step `old`, Pa.
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -165,7 +165,7 @@ class ContactLaw:
         trial = np.einsum("kij,kj->ki", P, old * on[:, None] - hold[:, None] * slip)
         size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
-        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until updated
+        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # else the shear stays until the next update
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
         scale = hold * np.where(slips, onward * most / size, 1.0)
         grip = scale[:, None, None] * (P - along[:, :, None] * along[:, None, :])
@@ -257,12 +257,8 @@ class ContactLaw:
 
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
         """Return the rounding errors of the forces (m,), N, of the pairs."""
-        return self.rounding_of_gap * self.stiffness(state) * self.pairs.area
-
-    @property
-    def rounding_of_gap(self) -> NDArray[np.float64] | float:
-        """Rounding error of gaps, m: (m,) for each pair, or one value for all."""
-        return 4 * EPSILON * self.pairs.largest_coordinate
+        of_gap = 4 * EPSILON * self.pairs.largest_coordinate
+        return of_gap * self.stiffness(state) * self.pairs.area
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""
@@ -283,7 +279,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep their deviation from the mean of the cell, because repeated averaging would cause creep.
+        In stick, pairs keep deviations of shear tractions from the mean in a cell; repeated averaging causes creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

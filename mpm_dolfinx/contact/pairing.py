@@ -38,17 +38,17 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, in cells, that may close in a step.  Steps with larger motion are rejected."""
+"""Largest gap / cell size that may close in a step.  Steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Gap, in cells, above which faces cannot touch before the next update of the pairs."""
+"""Gap / cell size above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration, in cells, above which a position lies behind a thin body and is not paired."""
+"""Penetration / cell size above which a position lies behind a thin body and is not paired."""
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""Distance from points on the other surface, in cells, within which corners follow the Q1 field."""
+"""(Distance from points on the other surface) / cell size below which corners follow the Q1 field."""
 PLACES = 1 << 32
-"""Number that exceeds the quadrature points of any process on a surface."""
+"""Upper bound of the number of quadrature points of a process on a surface."""
 
 
 class Facets(NamedTuple):
@@ -119,9 +119,9 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `present`.
+        """Return the contact law of pairs that were found for the points `seen`.
 
-        `points` are the points at the start of the step, with the contact history.
+        `points` are the points at the start of the step, with the contact history; `present` are the current points.
         """
         grid = self.grid
         d = self.grid.dim
@@ -173,7 +173,7 @@ class Contacts(Touching):
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of cells (m,), as number first * cells + second, that contact pairs may occupy in the step.
+        """Return all pairs of cells (m,), as integers first * cells + second, that contact pairs may join in the step.
 
         These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells.
         """
@@ -241,9 +241,9 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) just inside faces at positions x (m, d), or else the cells of the chosen facets.
+        """Return the cells (m,) just inside the chosen facets at positions x (m, d).
 
-        A cell must contain a quadrature point of the face.
+        If a cell contains no quadrature point of the face, the cell of the facet is returned in its place.
         """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells

@@ -5,11 +5,11 @@ A pair consists of a quadrature point on a surface and the opposite position, on
 With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
 at the start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This
-is repeated until the gaps match the faces at the end of the step.
+is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
-the equilibrium of the bodies, by
+the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
+together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
@@ -174,14 +174,18 @@ class ContactProblem(Loads):
         return self.pushed or self._cell_pairs is not None
 
     @property
-    def _still(self) -> NDArray[np.float64]:
-        """Zero displacements of tools by loads: (k,), or with free tools (k, q)."""
-        return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
+    def _loaded(self) -> NDArray[np.int64]:
+        """Indices of the tools that loads move; each of them couples all nodes under it."""
+        return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
 
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
-        key = self.now, at.unknowns, at.u[at.unknowns.owned]
-        return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
+
+        def find() -> Found:
+            w = self._apart_by(self.now.law, at)
+            return self._find_at(w, self._motion(w))
+
+        return self._found((self.now, at.unknowns, at.u[at.unknowns.owned]), find, self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
         """Return the relative displacements w (m, d), m, of the pairs of a law."""
@@ -197,9 +201,6 @@ class ContactProblem(Loads):
             return B, B.createVecLeft()
 
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
-
-    def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._motion(w) if self.pushed else self._still)
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         law = self.now.law
@@ -223,7 +224,7 @@ class ContactProblem(Loads):
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
-        for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
+        for number in self._loaded:
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
             more = outer(own, own)
             out = more if out is None else out + more
@@ -274,7 +275,12 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (tools,), m, of tools by loads at w (m, d), m, from the last linearisation."""
+        """Return the displacements of tools by loads at w (m, d), m, from the last linearisation.
+
+        Shape (tools,), or before the first substep of free tools (tools, q).
+        """
+        if not self.pushed:
+            return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
         linear, h = self.now.linear, self.grid.least
         if not over_all(self.grid.comm, int((w != linear.w).any())):
             return linear.motion
@@ -370,9 +376,9 @@ class ContactProblem(Loads):
         _, touches = self._seek(found)
         failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(failed)[:1]:
-            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain it?"
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain the tool?"
             if reaction[k] == 0:
-                why = "there is no contact within a cell: does it begin at the surface of a body?"
+                why = "there is no contact within a cell: does the tool start at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
         linear = self.now.linear
         motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
@@ -397,7 +403,7 @@ class ContactProblem(Loads):
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
         """Return the contact with pairs found at u, and the connected parts (parts,) in which gaps change by `DEPTH`.
 
-        Pairs that are open before and after are ignored.
+        Pairs that are open before and after the update are ignored.
         """
         found = self.found(at)
         law = self.now.law
@@ -432,9 +438,9 @@ class ContactProblem(Loads):
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do work.  Elastic slip in stick counts as dissipation, and is returned on unloading.
+        """See `Loads`.  Only tools do external work.  Elastic slip counts as dissipation, negative on unloading.
 
-        Contact pressures are taken to do no work, because velocities of substeps jump where a gap closes in a step.
+        Contact pressures are taken to dissipate nothing: velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)
@@ -443,7 +449,7 @@ class ContactProblem(Loads):
         moves = relative.array_r.reshape(-1, self.grid.dim)
         tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
         shear = law.pairs.area[:, None] * found.touch.shear[law.of]
-        # `push` has counted the power of the tools as a part of the nodes' power
+        # the power of the forces in `push` at the nodes is replaced by the power of the tools
         more = -float((found.balanced * moves).sum()) + float((found.touch.force * tool).sum())
         return -float((shear * (moves - tool)).sum()), more
 

@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return data for forms at the points with indices `rows`; values (n, ...): F, parameters and state of all."""
+        """Return form data at the points with indices `rows`; values (n, ...): F, parameters, state of all points."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube with the volume of a cell, m; in uneven grids, of the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell; in uneven grids, the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -220,9 +220,12 @@ class SoftnessAtPoints:
     volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.
     tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
-    With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent shear modulus
-    is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
-    current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
+    The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress tau at F - (1 - s) dF, the tangent shear
+    modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from
+    the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
+
+    At rest the strain is rounding, and its direction is random.  G_t is therefore a weighted mean: the modulus of the
+    step has the weight e : e, the modulus before the step the weight `NEAR`^4.  A step at rest thus changes nothing.
 
     Parameters
     ----------
@@ -247,15 +250,12 @@ class SoftnessAtPoints:
         tau = law.first_piola(F, values) * F.T
         e = ufl.sym(points.dF * ufl.inv(points.F))
         e -= ufl.tr(e) / d * ufl.Identity(d)
-        size = ufl.sqrt(ufl.inner(e, e) + NEAR**4)
-        self._along = PointExpression(ufl.as_vector([size, ufl.inner(ufl.diff(tau, s), e) / size]), points)
+        self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
-    def __call__(
-        self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64], dt: float
-    ) -> NDArray[np.float64]:
+    def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
         """Return the softness (n,), in [1, MOST], of points with F, parameters and state.
 
-        dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa; dt: length of the step, s.
+        dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): last softness.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -263,10 +263,9 @@ class SoftnessAtPoints:
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
         if self._local is not None:
             self._local.update(data)
-        strain, change = self._along.evaluate(data).T
-        elastic = 2 * shear * strain
-        soft = elastic / np.maximum(change, elastic / MOST)
-        return np.where(strain > NEAR**2, np.maximum(soft, 1.0), 1.0)
+        weight, work = self._along.evaluate(data).T
+        elastic = 2 * shear * (weight + NEAR**4)
+        return np.clip(elastic / np.maximum(work + 2 * shear * NEAR**4 / before, elastic / MOST), 1.0, MOST)
 
 
 class ConductivityAtPieces:
@@ -279,7 +278,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces: fields F, position, conductivity and porosity0, if a law is given.
+        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure
