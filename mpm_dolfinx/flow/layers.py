@@ -109,7 +109,15 @@ class MixedCells:
         for axis in range(self._x.shape[1]):
             fraction = np.delete(inside, axis, axis=1).prod(axis=1)
             kept = np.flatnonzero(fraction)
-            out.append((line[kept], piece[kept], fraction[kept]))
+            lines, fraction = line[kept], fraction[kept]
+            start, stop = (np.searchsorted(lines, lines, end) for end in ("left", "right"))
+            one, other = ranges(start, stop - start)  # all pairs of pieces on a line
+            a, b = (piece[kept][rows] for rows in (one, other))
+            overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
+            overlap = overlap.clip(0) / np.maximum(high[a] - low[a], NEAR)
+            beside = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)  # deformed boxes may overlap: both count half
+            counted = fraction + sum_by(one, beside * fraction[other] * overlap[:, axis], len(lines))
+            out.append((lines, piece[kept], fraction / np.maximum(counted, 1.0)))
         return out
 
     def mobility(
@@ -242,12 +250,8 @@ def graded(
     arithmetic minus the harmonic mean is distributed over the axes, by the variance of a linear variation along each
     axis.
 
-    Parameters
-    ----------
-    offset, kappa
-        Positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa s).
-    mean
-        Mean mobility of the filled cells (n,).
+    offset, kappa: positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa
+    s); mean: mean mobility of the filled cells (n,).
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)

@@ -106,18 +106,9 @@ def through(
 ) -> Through:
     """Return the conductances of faces between two pressures.
 
-    Parameters
-    ----------
-    laws
-        Relative conductivities as functions of pressure.
-    p
-        Pressures on both sides (m,), Pa.
-    paths
-        Paths of one or two cells (m, ...), from their pressure positions to the face.
-    lengths
-        Lengths of these paths (m,), m.
-    drops
-        Pressure drops (m,) caused by the fluid's weight along each path, from the first side to the second, Pa.
+    laws: relative conductivities as functions of pressure; p: pressures on both sides (m,), Pa; paths: paths of one or
+    two cells (m, ...), from their pressure positions to the face; lengths: lengths of these paths (m,), m; drops:
+    pressure drops (m,) caused by the fluid's weight along each path, from the first side to the second, Pa.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)

@@ -172,12 +172,8 @@ def _chunks(count: int, dim: int) -> list[slice]:
 def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
-    Parameters
-    ----------
-    corners : (n, 2^d, d), m
-        Corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
-    second, faces
-        Whether to compute second moments and face areas of the pieces.
+    corners (n, 2^d, d), m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`;
+    second, faces: whether to compute second moments and face areas of the pieces.
 
     Returns
     -------
@@ -502,12 +498,8 @@ def cut_faces(
     A face across a grid line must load the nodes on both sides in proportion to its parts. With one point per face, the
     error would move nodes of partly filled cells in every step without limit.
 
-    Parameters
-    ----------
-    corners : (m, 2^(d-1), d), m
-        Corners of the faces; triangles repeat their last corner.
-    local : (m, 2^(d-1), e)
-        Coordinates of the corners, to be interpolated.
+    corners (m, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (m, 2^(d-1), e):
+    coordinates of the corners, to be interpolated.
 
     Returns
     -------

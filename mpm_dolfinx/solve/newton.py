@@ -166,14 +166,8 @@ def note_pressures(
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
-    Parameters
-    ----------
-    seconds
-        Weight of the first rates in the step, s.
-    dt
-        Length of the step, s.
-    of_bodies
-        Function of active owned cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
+    seconds: weight of the first rates in the step, s; dt: length of the step, s; of_bodies: function of active owned
+    cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
