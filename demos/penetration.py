@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  The bar starts inside the clay
-and is pushed until the clay flows all around it.  Then the resistance of the bar is that of Randolph and Houlsby (1984)
-for an adhesion alpha s_u on its surface,
+The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  F is the force per length of the
+bar, D the diameter.  The bar starts inside the clay and is pushed until the clay flows all around it.  Then the
+resistance of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
@@ -18,10 +18,10 @@ and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only 
 seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter.  `spread`
 is the range of N in these parts, divided by the mean.
 
-Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
-c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
-once.  Domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as the
-other domains.
+Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D / c_v
+(velocity v, coefficient of consolidation c_v).  The water on top has the same pressure, so the clay starts without
+effective stress.  Wet clay is seeded only once.  Domains ahead of the bar are initially narrower, in proportion to
+their later stretch, and finally as wide as the other domains.
 
 With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
 larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
