@@ -62,7 +62,7 @@ remain.
 REMARKABLE = 0.05
 """Change of stress by balancing, divided by the largest given stress, above which there is a warning.
 
-It is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
+The value is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
 
 

@@ -184,7 +184,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of outer faces, and an index of the set of conditions on each, -1 if it forbids renewal."""
+        """Return keys of outer faces, and the index of each face's set of conditions; -1: the set forbids renewal."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
