@@ -261,9 +261,9 @@ class BarcelonaBasic(ModifiedCamClay):
     reference
         Stress P_r, Pa, > 0; if P_c0 < P_r, P_c does not depend on suction.  Usually 0.01 to 0.5 times the initial P_c0.
 
-    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables are those of
-    Modified Cam Clay, with ln(P_c0 / initial P_c0) as `consolidated`, and `suction` and `suction_at_start`, Pa.
-    Source: Alonso, Gens and Josa (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables: `plastic`,
+    `consolidated` = ln(P_c0 / initial P_c0), `suction` and `suction_at_start`, Pa.  Source: Alonso, Gens and Josa
+    (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------

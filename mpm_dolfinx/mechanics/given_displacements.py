@@ -213,7 +213,7 @@ class GivenDisplacements(Acting):
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
-        """Warn, once for each condition, of what is wrong with the condition with this index."""
+        """Warn of an error of the condition with this index, once for each condition."""
         if (number, what) not in self._warned:
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
             self._warned.add((number, what))

@@ -70,9 +70,9 @@ def inner_cells(
     """Return the local cells (n,) whose constraints contain the points of sides.
 
     After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
-    beyond the line.  Constraints there would contradict those of inner cells: only a large motion of nodes beyond the
-    line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain these points
-    too (aggregation; Badia, Verdugo and Martin 2018).
+    beyond the line.  Constraints there would contradict the constraints of inner cells: only a large motion of nodes
+    beyond the line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain
+    these points too (aggregation; Badia, Verdugo and Martin 2018).
 
     fill (cells,): volume fraction; sides: for each condition its prescribed components, and the extent (d,), m, of its
     prescribed positions.  For each point: index of its condition, `number` (n,); its owned `cell` (n,); its outward
@@ -93,7 +93,7 @@ def inner_cells(
 
 
 class HeldCells:
-    """Penalties of prescribed displacements: those on means, one for each condition and cell, then those at points.
+    """Penalties of prescribed displacements: first on means, one for each condition and cell, then at points.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ class CellFields:
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
         Pore fluid, as a volume at zero pressure: the content from porosity and pressure, minus its excess `owed` over
-        the true content (see `flow.storage`); None without fluid.
+        the true content (see `flow/storage.py`); None without fluid.
     """
 
     cell: NDArray[np.int64]

@@ -282,7 +282,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including those of the earlier run that it continues."""
+    """Wall time and profile of a run, including the earlier run that this run continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
