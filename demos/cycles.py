@@ -74,7 +74,7 @@ def cycle(
     h, load
         Cell size, m; largest load, Pa.
     cycles, steps
-        Cycles, and steps in each, even.
+        Number of cycles; number of steps in a cycle, even.
     quadrature
         Quadrature at the material points, see `mpm.Numerics`.
     material

@@ -187,7 +187,7 @@ class Cells:
         return out
 
     def move(self, grid: Grid) -> None:
-        """Move mesh, nodes and cells to the current lines of the grid.  Their positions depend on nothing else."""
+        """Move mesh, nodes and cells to the current lines of the grid; positions depend only on these lines."""
         if grid.follow is None:
             return
         node_x, x = map(grid.places, self._index)

@@ -191,7 +191,7 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the final stresses of least violation (n, 3), Pa, derivatives (n, 3, 3) and violations (n,)."""
+        """Return the valid final stresses (n, 3), Pa, their derivatives (n, 3, 3), and their violations (n,)."""
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:

@@ -85,7 +85,7 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): the m vertices by `vertices`."""
+    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): vertices, see `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)

@@ -208,8 +208,7 @@ def _released(
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with the data that conditions store: initial values, or the data of `before`, the same points.
-    """
+    """Return the points with the data that conditions store: initial values, or data of the same points `before`."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")

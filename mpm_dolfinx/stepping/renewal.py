@@ -237,7 +237,7 @@ class Renewal:
         volume0 = V[group] * size / A[group] / ratio
 
         def kept(values: NDArray) -> NDArray:
-            """Return means with an exact mass-weighted sum; its defect is distributed within the values' range."""
+            """Return means with an exact mass-weighted sum: corrections stay within the values' range."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
