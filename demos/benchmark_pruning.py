@@ -7,9 +7,9 @@ a conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation w
 is the relative difference between the final settlements of the two scenes.  In the pair for mean dilatation, this
 difference is caused by different Poisson ratios.
 
-Steps of both scenes alternate, --repeat times.  The shortest step of each scene is used, because other work on the
-machine only increases times.  The compile time is the additional time for the scene and its first step if the cache of
-compiled forms is empty.  Memory is the peak memory with a full cache.  All times are processor times.
+The two scenes are timed in turn, one step each, --repeat times.  The shortest step of each scene is used, because other
+work on the machine only increases times.  The compile time is the additional time for the scene and its first step if
+the cache of compiled forms is empty.  Memory is the peak memory with a full cache.  All times are processor times.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """A skeleton with a fourfold tau, so that pressure jumps are evaluated in `conducting`, but not damped."""
+    """A skeleton with four times the damping tau: `conducting` evaluates pressure jumps, but does not damp them."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  The bar starts inside the clay
-and is pushed until the clay flows all around it.  Then the resistance of the bar is that of Randolph and Houlsby (1984)
-for an adhesion alpha s_u on its surface,
+The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  F is the force per length of the
+bar, D the diameter.  The bar starts inside the clay and is pushed until the clay flows all around it.  Then the
+resistance of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 

@@ -196,7 +196,7 @@ class Loads:
         """Subtract forces at u from the residual of unknowns or fixed components.  The residual's scale omits them."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return the inertia forces at u, N, or None.  They enter the residual and its scale."""
+        """Return the inertia forces at u, N, or None.  These forces enter the residual and its scale."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` adds to the pattern of the cells, or None."""

@@ -96,9 +96,9 @@ class Pressure(Condition):
     """Pressure on a side of the bodies: always normal to the moving surface, per current area.
 
     The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
-    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is
-    closed, or ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the
-    stability of dry equilibria is not checked.
+    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if the loaded surface
+    is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric (LU,
+    FGMRES), and the stability of dry equilibria is not checked.
 
     Parameters
     ----------
@@ -390,9 +390,9 @@ RIGIDITY = 1e4
 HOLD = 3e2
 """Penalty stiffness for cell means of prescribed displacements, in units of (modulus from `holding`) / (cell size).
 
-The displacement error is (change of traction in the step, except by rotation) / (modulus) x (cell size) / HOLD.  It
-does not accumulate, because each step measures it from the prescribed position.  Where a body is much stiffer than the
-penalty, multipliers remove the error, see `HoldLoads.augment`.
+The displacement error is (change of traction in the step, except by rotation) / (modulus) x (cell size) / HOLD.  The
+error does not accumulate, because each step measures the error from the prescribed position.  Where a body is much
+stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
 
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.

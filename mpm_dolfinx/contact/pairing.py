@@ -245,7 +245,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) must follow the Q1 field, near another group; points: at the start."""
+        """Return which corners (n, 2^d, d) are near another group; points: at the start of the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:

@@ -80,13 +80,13 @@ class Tool:
     rotation_rad : float or callable t (s) -> float, rad
         Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
     centre : (d,), m
-        Centre of rotation, reference of moments, and centre of mass of a free tool.  It moves with the tool.  By
-        default the centroid of a free disc or polygon, else the origin.
+        Centre of rotation, reference of moments, and centre of mass of a free tool.  The centre moves with the tool.
+        By default the centroid of a free disc or polygon, else the origin.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0.  Where it exceeds ten times the normal pressure, it is
-        reduced to that value.  For undrained soil: alpha s_u, with friction 0.
+        Additional shear strength of the contact, Pa, >= 0.  An adhesion above ten times the normal pressure is reduced
+        to this value.  For undrained soil: alpha s_u, with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
         The tool moves along `direction`, in addition to its displacement, until the reaction equals the load, from the
         first step on.  The tool must start in contact, or less than a cell away.  `tool_travel` of the simulation

@@ -98,8 +98,8 @@ def cell_ratios(
     volumes are meaningless near plastic flow.
 
     cut, points: cut particle domains, and points at the start of the step; share (n,): weight, in [0, 1], of the ratio
-    from corners in its geometric mean with the ratio of the point; 0 without mean dilatation.  flows (n,): whether
-    points have yielded.
+    from corners in the geometric mean of this ratio and the ratio of the point; 0 without mean dilatation.  flows (n,):
+    whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

@@ -2,9 +2,9 @@
 """Fluxes between two cells through unsaturated soils in series.
 
 The soils between the pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local
-unknowns of each face.  Newton's method finds them from the continuity of the flux; they are then condensed.  Each soil
-conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
-therefore exact at any offset from the grid.
+unknowns of each face.  Newton's method finds these pressures from the continuity of the flux, and condensation
+eliminates them.  Each soil conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through
+layers of exponential soil is therefore exact at any offset from the grid.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
 cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over the

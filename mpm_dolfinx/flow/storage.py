@@ -411,7 +411,9 @@ class StorageProblem:
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._correction = self._begin(outflow)
-        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent leaves it out."""
+        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent omits this
+        correction.
+        """
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -479,7 +481,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors of the water content that pressure errors (n,), Pa, cause, and its changes in the step."""
+        """Return errors of the water content due to pressure errors (n,), Pa, and the content's changes in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -617,7 +619,7 @@ class StorageProblem:
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for its pieces or for `data`.
+        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for the problem's pieces or `data`.
 
         `of_suction` are cells (c,) and derivatives of their nodal forces (c, n) by p, m^(d-1), if a law depends on
         suction.

@@ -49,9 +49,9 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
     k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k; y is x drop / (jump
-    of the pressure).  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).  It is exact for
-    steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.  Without gravity
-    it is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
+    of the pressure).  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).  The result is exact
+    for steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.  Without
+    gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
 
     Parameters
     ----------

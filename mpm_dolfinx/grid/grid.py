@@ -187,7 +187,7 @@ class Cells:
         return out
 
     def move(self, grid: Grid) -> None:
-        """Move mesh, nodes and cells to the current lines of the grid.  Their positions depend on nothing else."""
+        """Move mesh, nodes and cells to the current lines of the grid; positions depend only on these lines."""
         if grid.follow is None:
             return
         node_x, x = map(grid.places, self._index)
@@ -247,18 +247,29 @@ class Grid:
 
     Attributes
     ----------
-    dim, shape, lower, upper
-        Dimension d; number of cells along each axis (d,); corners (d,), m.
-    even, lines, widths
-        Whether all cells are equal; current lines (n,) along each axis, relative to `base`, m; edge lengths (n - 1,)
-        along each axis, m.
-    finest, least, most
-        Shortest edge along each axis (d,), m; shortest and longest edge of all cells, m.
+    dim
+        Dimension d.
+    shape : (d,)
+        Number of cells along each axis.
+    lower, upper : (d,), m
+        Corners of the grid.
+    even
+        Whether all cells are equal.
+    lines : (n,) along each axis, m
+        Current lines, relative to `base`.
+    widths : (n - 1,) along each axis, m
+        Current edge lengths of the cells.
+    finest : (d,), m
+        Shortest edge along each axis.
+    least, most : m
+        Shortest and longest edge of all cells.
     snap
         (Distance to a grid plane) / (cell size) along each axis (d,), below which a vertex lies on the plane.
-    base, low, high
-        Origin (d,), m, of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin
-        preserves digits of positions far from the true origin.  Lower and upper corner relative to `base`.
+    base : (d,), m
+        Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
+        digits of positions far from the true origin.
+    low, high : (d,), m
+        Lower and upper corner relative to `base`.
     stretches
         Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
     mesh

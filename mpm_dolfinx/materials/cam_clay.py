@@ -16,8 +16,8 @@ plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a).  It gives the stress ratio at the end, Q / (M P) = sqrt(w) exp(-d/2).  On the yield
-surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
+The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d, Q / (M P) = sqrt(w) exp(-d/2).  On the
+yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
 isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the
@@ -261,9 +261,9 @@ class BarcelonaBasic(ModifiedCamClay):
     reference
         Stress P_r, Pa, > 0; if P_c0 < P_r, P_c does not depend on suction.  Usually 0.01 to 0.5 times the initial P_c0.
 
-    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables are those of
-    Modified Cam Clay, with ln(P_c0 / initial P_c0) as `consolidated`, and `suction` and `suction_at_start`, Pa.
-    Source: Alonso, Gens and Josa (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables: `plastic`,
+    `consolidated` = ln(P_c0 / initial P_c0), `suction` and `suction_at_start`, Pa.  Source: Alonso, Gens and Josa
+    (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------

@@ -72,7 +72,7 @@ class LocalUnknowns:
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
         The unknowns and `trial`, for expressions that are not differentiated with respect to F: kernels then skip the
-        trial values.  For laws with an energy it equals `values`.
+        trial values.  For laws with an energy `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):

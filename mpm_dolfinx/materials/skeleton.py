@@ -327,8 +327,8 @@ class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
     Plane strain in 2D.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
-    eigenvalues of C = F^T F finite.  Only the deviatoric part contains it, with zero derivative at F = I.  The stress
-    at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
+    eigenvalues of C = F^T F finite.  Only the deviatoric part contains this constant, with zero derivative at F = I.
+    The stress at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
     """
 
     @staticmethod

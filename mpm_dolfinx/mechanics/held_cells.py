@@ -71,9 +71,9 @@ def inner_cells(
     """Return the local cells (n,) whose constraints contain the points of sides.
 
     After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
-    beyond the line.  Constraints there would contradict those of inner cells: only a large motion of nodes beyond the
-    line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain these points
-    too (aggregation; Badia, Verdugo and Martin 2018).
+    beyond the line.  Constraints there would contradict the constraints of inner cells: only a large motion of nodes
+    beyond the line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain
+    these points too (aggregation; Badia, Verdugo and Martin 2018).
 
     fill (cells,): volume fraction; sides: for each condition its prescribed components, and the extent (d,), m, of its
     prescribed positions.  For each point: index of its condition, `number` (n,); its owned `cell` (n,); its outward
@@ -105,9 +105,11 @@ class HeldCells:
 
     Attributes
     ----------
-    number, cell, x, shape, moments
-        For each penalty: index of the condition; cell; position, m; shape functions; products of offsets from the
-        cell's midpoint, m^2 and m^3.  For a penalty on a mean, the last three are means over its points.
+    number, cell
+        Index of the condition, and cell, of each penalty.
+    x, shape, moments
+        Position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3, of each penalty;
+        for a penalty on a mean, these are means over its points.
     stiffness
         Stiffness of each penalty and component, N/m.  Normal to a side parallel to the grid: from the confined modulus.
     limit : (2, k, d)

@@ -307,7 +307,7 @@ class Mass:
 
         points: material points at the start of the step; velocities: velocities of the unknowns at the start and the
         end of the step, m/s; moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the
-        point; 0 if its cut is kept.
+        point; 0 if the point keeps its pieces.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}

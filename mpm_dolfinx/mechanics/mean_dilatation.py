@@ -14,10 +14,10 @@ the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives by
-theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material
-point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar.
-The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
+At fixed theta and pi, the residual has the additional term with pi, and the residual's tangent is symmetric. The
+derivatives by theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in
+the material point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points
+store Fbar.  The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class SumsOfPart(NamedTuple):
 
 
 class FBar:
-    """F-bar modification of laws, with the volume ratio theta of the step in each cell and its mean stress pi.
+    """F-bar modification of laws, with the volume ratio theta of the step and the conjugate mean stress pi of each
+    cell.
 
     grid: background grid; symmetric: whether the tangents of all laws are symmetric.
     """

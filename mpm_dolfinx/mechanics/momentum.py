@@ -206,7 +206,7 @@ class MomentumForms:
 
     @cached_property
     def nodal(self) -> NDArray[np.float64]:
-        """u by nodes (nodes, d), m."""
+        """Displacement increment u as an array (nodes, d), m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:

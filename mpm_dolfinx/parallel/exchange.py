@@ -61,7 +61,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row; return the answers to this process, in the order it sent."""
+        """Send back one answer for each received row; return the answers to this process, in the order of its rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)

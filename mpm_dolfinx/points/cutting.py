@@ -5,9 +5,9 @@ A material point has a quadrilateral or hexahedral domain with tracked corners. 
 centroids, in 3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear.
 One quadrature point per piece therefore integrates these gradients exactly, wherever the domain lies on the grid.
 
-The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles match those of
-neighbouring domains, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives
-the volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
+The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
+domains match, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives the
+volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
 interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
 
 In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
@@ -85,7 +85,7 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): the m vertices by `vertices`."""
+    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): vertices, see `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)

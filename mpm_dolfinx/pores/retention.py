@@ -450,8 +450,8 @@ def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[n
 FARTHEST = np.log(10)
 """Largest change of the suction's logarithm in a Newton step; without a limit, fronts in dry soil do not converge.
 
-Celia's column of 25 and 100 cells takes 310 and 500 Newton steps in 28 time steps with a limit of 2.  With a limit of
-4 it takes 330 and 920, and four time steps are reduced.
+Celia's column of 25 and 100 cells takes 310 and 500 Newton steps in 28 time steps with a limit of 2.  With a limit of 4
+the column takes 330 and 920, and four time steps are reduced.
 
 Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
 and finer cells by 6.6e-03.
@@ -468,7 +468,8 @@ def restrained(
 
     A step across the characteristic suction ends there.  On each side of this suction the saturation is convex or
     concave, so Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at most
-    `FARTHEST`.  If the direction reverses, it changes by at most half of its previous change: no oscillations.
+    `FARTHEST`.  If the direction of the change reverses, the change is at most half of the previous change, so that the
+    logarithm does not oscillate.
 
     p (n,), Pa: pressures; dp (n,), Pa: decreases of these by Newton's method; scale (n,), Pa: characteristic suction;
     previous (n,): change of the pressure's `logarithm` in the previous Newton step.

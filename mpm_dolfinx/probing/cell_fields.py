@@ -18,8 +18,8 @@ from mpm_dolfinx.stepping.state import State
 class CellFields:
     """Fields in the non-empty cells of this process; arrays for n cells.
 
-    The fields refer to the cells at the position of the grid for the next step.  They are second-order accurate at `x`,
-    not at the midpoint of the cell.  Means are volume averages over the material in the cell.
+    The fields refer to the cells at the position of the grid for the next step.  The fields are second-order accurate
+    at `x`, not at the midpoint of the cell.  Means are volume averages over the material in the cell.
 
     Attributes
     ----------

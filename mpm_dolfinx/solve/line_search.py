@@ -15,8 +15,8 @@ Flowing soil has almost no stiffness along its mechanisms, and negative stiffnes
 overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
 relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows with
 the step length for any soil. Soil that has not yielded is regularised too, because full steps overshoot just as far
-when this soil first yields. Before any soil yields there is no regularisation while the tangents converge: with it, wet
-elastic soil would take 1.6 times the Newton steps.
+when this soil first yields. Before any soil yields there is no regularisation while the tangents converge: with
+regularisation, wet elastic soil would take 1.6 times the Newton steps.
 
 A few flowing points may give the tangent a negative stiffness. Newton's direction then leads backwards: it unloads
 these points, the next step loads them again, and the iterations cycle. The work of the residuals along the direction is

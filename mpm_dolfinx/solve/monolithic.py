@@ -167,8 +167,8 @@ class BlockSolver:
 
         Parameters
         ----------
-        scales : (parts,), (parts,)
-            Scales of both residuals in each connected part, N and m^d.
+        scales : (parts,) and (parts,)
+            Scales of the residuals of momentum, N, and fluid, m^d, in each connected part.
         rtol
             Tolerance relative to the norm of both scaled residuals, for each part.
         slopes

@@ -11,12 +11,12 @@ A Newton step of the two problems reads
 
 K, B and C are derivatives of the residuals: R_u changes by K du - B^T dp, R_p by B du + C dp. `schur-cg` eliminates du,
 and solves with S = C + B K^-1 B^T by conjugate gradients. The preconditioner is the fixed-stress operator C + beta V,
-with cell volumes V and beta = 0.75 alpha^2 / K_dr (Biot's coefficient alpha, drained bulk modulus K_dr). It is
-filtered: beta V is smaller for pressures that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).
-`schur-fgmres` does the same with the full, slightly unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of
-the fixed-stress split: a storage solve with C + beta V at constant stress, and a momentum solve, alternate. Large
-bodies use multigrid, because a direct solver is too expensive. `schur-cg` and `schur-fgmres` then solve for both
-unknowns together, see `monolithic`.
+with cell volumes V and beta = 0.75 alpha^2 / K_dr (Biot's coefficient alpha, drained bulk modulus K_dr). This operator
+is filtered: beta V is smaller for pressures that alternate from cell to cell
+(`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
+`fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve with C + beta V at constant
+stress, and a momentum solve, alternate. Large bodies use multigrid, because a direct solver is too expensive.
+`schur-cg` and `schur-fgmres` then solve for both unknowns together, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ class Newton:
         self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
-        """Solve both balances by Newton's method; a tangent is kept while it converges, by linear laws over many steps.
+        """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
 
         serves: whether the tangent of the previous substep may be reused.
         """

@@ -9,8 +9,8 @@ preconditioned with the fixed-stress operator. For large bodies GMRES solves for
 `monolithic`.
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, to the same digits.
-A solve takes 0.8 to 1 times as long. But it needs a copy of -B^T for each tangent, and fixed-stress iterations would
-still need the blocks.
+A solve takes 0.8 to 1 times the time of a solve here. But PCFIELDSPLIT needs a copy of -B^T for each tangent, and
+fixed-stress iterations would still need the blocks.
 """
 
 from __future__ import annotations

@@ -119,7 +119,8 @@ class Motion:
         stays
             Whether points that hardly move may keep their pieces.
         carried
-            Function that returns new velocities (`Mass.carried`) for the points' motion (n,) in cells, 0 if cuts stay.
+            Function that returns new velocities (`Mass.carried`) for the points' motion (n,) in cells, 0 for kept
+            pieces.
 
         Raises
         ------

@@ -256,8 +256,9 @@ class OnGrid(Keyed):
     ) -> list[NDArray[np.float64]]:
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
-        The mean of the pieces' mass potentials in a cell is the cell's potential. Its weight is `store` (m,), m^d/Pa,
-        the pieces' storage; in cells without storage their volume. t: time, s, of the pressures on drained sides.
+        The mean of the pieces' mass potentials in a cell is the cell's potential. The mean is weighted by `store` (m,),
+        m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of the pressures on drained
+        sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
         hydrostatic pressures `at_rest`, if there is gravity.

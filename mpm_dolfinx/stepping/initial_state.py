@@ -62,7 +62,7 @@ remain.
 REMARKABLE = 0.05
 """Change of stress by balancing, divided by the largest given stress, above which there is a warning.
 
-It is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
+The value is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
 
 
@@ -208,7 +208,7 @@ def _released(
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with the data that conditions store: initial values, or those of `before`, the same points."""
+    """Return the points with the data that conditions store: initial values, or data of the same points `before`."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
@@ -358,10 +358,11 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 def balanced(scene: Scene, state: State) -> State:
     """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
-    A displacement w of the grid is balanced with the strains of the pieces. Points store the mean strain of their
-    domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes; nodal forces `State.held` balance the remainder. Support forces are evaluated at
-    the displacement w, `State.rest`, so sides keep their seeded positions for any prescribed displacement at the start.
+    For points with the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
+    Points store only mean strains of their domains, so w + u(w) is not in equilibrium yet. The fixed-point iteration w
+    <- w + u(w) follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes; nodal forces
+    `State.held` balance the remainder. Support forces are evaluated at the displacement w, `State.rest`, so sides keep
+    their seeded positions for any prescribed displacement at the start.
 
     Raises
     ------

@@ -200,7 +200,7 @@ class Mandel:
 
 
 def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure at the centre of a sphere under surface load that drains at its surface.
+    """Return the pore pressure at the centre of a sphere that is loaded and drains at its surface.
 
     Parameters
     ----------
