@@ -182,12 +182,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
     A surface counts as open if corners of its faces lie on the edges of other faces.
 
-    Parameters
-    ----------
-    free : (nodes, d)
-        Which displacement components walls leave free.
-    pressures
-        Pressures and their faces.
+    free (nodes, d): which displacement components walls leave free; pressures: pressures and their faces.
     """
     if not pressures:
         return True

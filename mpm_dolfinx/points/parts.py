@@ -81,16 +81,8 @@ def largest_of_bodies(
 ) -> NDArray[np.float64]:
     """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
 
-    Parameters
-    ----------
-    comm
-        The processes.
-    part : (m,)
-        Connected part of each value, from 0.
-    values : (k, m)
-        Values of this process.
-    inside : (bodies, parts)
-        Whether this process has points of the body in the part.
+    comm: the processes; part (m,): connected part of each value, from 0; values (k, m): values of this process; inside
+    (bodies, parts): whether this process has points of the body in the part.
     """
     largest = np.full((len(values), inside.shape[1]), -np.inf)
     for row, found in zip(values, largest, strict=True):
