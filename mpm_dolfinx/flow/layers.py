@@ -115,8 +115,8 @@ class MixedCells:
             a, b = (piece[kept][rows] for rows in (one, other))
             overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
             overlap = overlap.clip(0) / np.maximum(high[a] - low[a], NEAR)
-            beside = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)  # deformed boxes may overlap: both count half
-            counted = fraction + sum_by(one, beside * fraction[other] * overlap[:, axis], len(lines))
+            adjacent = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)  # deformed boxes may overlap: both count half
+            counted = fraction + sum_by(one, adjacent * fraction[other] * overlap[:, axis], len(lines))
             out.append((lines, piece[kept], fraction / np.maximum(counted, 1.0)))
         return out
 
