@@ -348,8 +348,10 @@ class StorageProblem:
 
     Parameters
     ----------
-    forms, system
-        Compiled forms; vectors and matrices, with the assembled fluxes.
+    forms
+        Compiled forms.
+    system
+        Vectors and matrices, with the assembled fluxes.
     data
         Quadrature points of the pieces.
     contents

@@ -394,8 +394,10 @@ class MomentumProblem:
 
     Parameters
     ----------
-    forms, system
-        Compiled forms; vectors and matrices, with assembled penalties.
+    forms
+        Compiled forms.
+    system
+        Vectors and matrices, with assembled penalties.
     data
         Integration points.
     loads
