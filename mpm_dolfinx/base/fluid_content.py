@@ -2,7 +2,7 @@
 """Fluid content of the pores: the quantity stored in the fluid balance.
 
 Per reference volume, the content zeta changes by d zeta = alpha dJ + S J dp.  alpha is Biot's coefficient, J the volume
-ratio, p the pore pressure, and S = n / K_w + (alpha - n) / K_s the storage coefficient, with the bulk moduli K_w of
+ratio, and p the pore pressure.  S = n / K_w + (alpha - n) / K_s is the storage coefficient, with the bulk moduli K_w of
 water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, at first n0.  Therefore S J = a J + b is linear in J,
 with a = S(n = 1), and
 
@@ -13,7 +13,7 @@ computed as alpha times the change of this mass, divided by rho at the mean pres
 second-order accurate for any path.  In a step of any size without flow of fluid, the formula gives exactly zero.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
-kappa = conductivity / unit weight, and the mass potential pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
+kappa = conductivity / unit weight.  The mass potential is pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
 The density between pressures p- and p+ is, in units of rho_w, the logarithmic mean (pi+ - pi-) / (p+ - p-).
 """
 

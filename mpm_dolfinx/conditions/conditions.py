@@ -129,7 +129,7 @@ class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
     The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
-    the normal and rho c_s in the tangent plane, with the density rho and the speeds c_p and c_s of compression and
+    the normal and rho c_s in the tangent plane.  rho is the density; c_p and c_s are the speeds of compression and
     shear waves.  Waves along the normal are absorbed completely; a few per cent of oblique waves are reflected.  A side
     that was fixed in a stage without inertia keeps its tractions.  Bodies with weight need such a stage.
 
@@ -435,8 +435,8 @@ class Displacement(Condition):
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  Where the box ends within a cell, the cell's node
-        outside the box is prescribed if the box covers more than half of the cell, and free otherwise.
+        Box of reference positions; faces inside it are prescribed.  Let the box end within a cell.  The cell's node
+        outside the box is prescribed if the box covers more than half of the cell, otherwise free.
 
     Raises
     ------

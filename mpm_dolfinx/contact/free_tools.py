@@ -2,9 +2,9 @@
 """Free tools: rigid tools with a mass, which weight, loads and contact forces move.
 
 Let q be the motion of a tool in a step: displacement and, in 2D, rotation.  The equation of motion has the form of that
-of nodes (`mechanics/inertia.py`), m (q - q^) / (g dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, q^ is
-the motion without forces in the step, g is the weight of the substep's rate, and dt is the length of the step.  l is
-the load, and f are the contact forces on the points.  A q is the displacement of the contact positions on the tool.
+of nodes (`mechanics/inertia.py`), m (q - q^) / (g dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, and q^
+is the motion without forces in the step.  g is the weight of the substep's rate, and dt is the length of the step.  l
+is the load, and f are the contact forces on the points.  A q is the displacement of the contact positions on the tool.
 The columns of A are e_x, e_y, and e_z x r with the lever arm r.
 
 The unknowns q are condensed.  Let D be minus the derivative of f by the displacement of the points, and dw the

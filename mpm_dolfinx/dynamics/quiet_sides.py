@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Quiet boundaries with the traction t = t_0 - Z (v - 2 v_in) and the impedance Z = rho c_p n n + rho c_s (I - n n).
 
-t_0 is the constant traction at rest, v the velocity of the side, v_in that of an incoming wave, n the normal, rho the
-density; c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969; incoming waves: Joyner
-and Chen 1975).  Impedances use small-strain moduli of undrained soil.
+t_0 is the constant traction at rest, v the velocity of the side, and v_in that of an incoming wave.  n is the normal,
+rho the density; c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969; incoming waves:
+Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
 """
 
 from __future__ import annotations

@@ -31,8 +31,12 @@ class Borders:
     ----------
     contents
         Material in the cells.
-    cells, soils, law
-        Arrays over the m pieces: cell (m,); constants of the soil (m, k); index of the retention curve (m,).
+    cells : (m,)
+        Cell of each piece.
+    soils : (m, k)
+        Constants of the soil of each piece.
+    law : (m,)
+        Index of the retention curve of each piece.
     facets
         Facets of this process between two active cells.
     mixed

@@ -2,9 +2,9 @@
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
 The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
-p is the pressure at the centroid x of the cell's material, p_out the pressure outside at the face, x_out, and T = A
-kappa / d, with the area A of the face, the mobility kappa = (conductivity) / (unit weight), and the distance d from x
-to the face.  r is the density of the fluid divided by the density at zero pressure.  At a seepage face, fluid can only
+p is the pressure at the centroid x of the cell's material, and p_out the pressure outside at the face, x_out.  T is A
+kappa / d, with the area A of the face, the mobility kappa (conductivity / unit weight), and the distance d from x to
+the face.  r is the density of the fluid divided by the density at zero pressure.  At a seepage face, fluid can only
 leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the
 others: at the start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most
 the inflow at the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V

@@ -2,9 +2,10 @@
 """Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
 
 The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
-fluxes through the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the
-material in a cell, and J = det F, the cell's mobility kappa (conductivity / unit weight) becomes J F^-1 kappa F^-T.
-`drained_sides` computes fluxes through open sides; `StorageProblem` in `storage` adds up both kinds of fluxes.
+fluxes through the deformed cells are pulled back to the start of the step.  kappa is the mobility of a cell
+(conductivity / unit weight).  With F = I + grad u at the centroid of the cell's material, and J = det F, kappa becomes
+J F^-1 kappa F^-T. `drained_sides` computes fluxes through open sides; `StorageProblem` in `storage` adds up both kinds
+of fluxes.
 """
 
 from __future__ import annotations

@@ -6,11 +6,12 @@ harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exa
 the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
 conductivity blocks all lines of some cell, and a drain contains complete lines.
 
-The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  With
-the resistance R of the line, and s from 0 to 1 along the line, the resistance from this position to the lower end is
-int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through several cells.  For
-layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a drain would be
-interrupted between rows of cells.  The shape of a piece is approximated by the bounding box of its domain in the cell.
+The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  Let
+R be the resistance of the line, and let s increase from 0 to 1 along the line.  The resistance from this position to
+the lower end is int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through
+several cells.  For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a
+drain would be interrupted between rows of cells.  The shape of a piece is approximated by the bounding box of its
+domain in the cell.
 
 A conductivity that depends on deformation varies even in cells without layers, see `graded`.
 """

@@ -54,8 +54,7 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 class Gradients:
     """Gradients of the head in cells that need the non-orthogonal correction: centroids offset along a face or side.
 
-    The object is valid for one cut, and depends only on the geometry of `contents`, the material in the cells, and of
-    `sides`, the open sides of the bodies.
+    The object is valid for one cut.  contents: material in the cells; sides: open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):

@@ -3,8 +3,8 @@
 
     (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
 
-with the weight w of a cell and axis, the edge length h of the cell along the axis, the pressures p_+- of the
-neighbours, and the distances d_+- between centroids of the material.  A cell has a term along an axis if both faces
+with the weight w of a cell and axis, and the edge length h of the cell along the axis.  p_+- are the pressures of the
+neighbours, and d_+- the distances between centroids of the material.  A cell has a term along an axis if both faces
 across this axis are open.  For a pressure that alternates from cell to cell, the damping coefficient is 16 w; damping
 of pressure jumps with the weight w would give 4 w.  A uniform gradient is not damped, also at the sides of the body, so
 steep pressures are not smeared.  The sum of H p over the cells is zero, so damping conserves fluid.

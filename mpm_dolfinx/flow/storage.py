@@ -348,8 +348,10 @@ class StorageProblem:
 
     Parameters
     ----------
-    forms, system
-        Compiled forms; vectors and matrices, with the assembled fluxes.
+    forms
+        Compiled forms.
+    system
+        Vectors and matrices, with the assembled fluxes.
     data
         Quadrature points of the pieces.
     contents
@@ -656,9 +658,9 @@ class StorageProblem:
             Multiple of beta, >= 0.
         share
             Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  With the stiffness K, B K^-1 B^T
-            equals beta V for a smooth pressure, zero for a checkerboard, and beta V / 2 (at nu = 0) for a pressure that
-            alternates along one axis.  beta V - L equals the same values, with L = sum over faces of min(beta V+, beta
-            V-) / (4 d) [p][q].
+            equals beta V for a smooth pressure, and zero for a checkerboard.  It equals beta V / 2 (at nu = 0) for a
+            pressure that alternates along one axis.  beta V - L equals the same values, with L = sum over faces of
+            min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

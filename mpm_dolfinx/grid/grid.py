@@ -131,14 +131,20 @@ class Cells:
 
     num_owned, num_local
         Number of cells without and with ghosts.
-    cell_nodes, signs
-        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from midpoint to nodes (2^d, d).
+    cell_nodes : (cells, 2^d)
+        Nodes of each cell, as numbered in Q1 functions.
+    signs : (2^d, d)
+        Directions from the midpoint of a cell to its nodes.
     at
         Current positions.
-    cell_number, locals, owners
-        Lexicographic index of each local cell; for all cells, copy by copy: local index, or -1, and owner rank.
-    cell_facets, facet_cells
-        Facets of each cell (cells, 2d); cells at each facet (facets, 2), -1 outside the boundary.
+    cell_number
+        Lexicographic index of each local cell.
+    locals, owners
+        Local index, or -1, and owner rank of all cells of the grid, copy by copy.
+    cell_facets : (cells, 2d)
+        Facets of each cell.
+    facet_cells : (facets, 2)
+        Cells at each facet, -1 outside the boundary.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):

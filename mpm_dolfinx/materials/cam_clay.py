@@ -7,11 +7,11 @@ elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(ta
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
-and flow is associated.  M is the slope of the critical state line, P_c the size of the yield surface, P_0 the pressure
-at F = I, and e_v^p the plastic volume strain.  P and P_c follow the bilogarithmic law: ln v (v: specific volume) is
-linear in ln P, with the slope lambda in first loading, kappa in unloading.  The stress at the end of a step follows
-implicitly from the trial stresses P_t and Q_t, and from P_c,n at the start.  The plastic compaction is kappa a.  The
-plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
+and flow is associated.  M is the slope of the critical state line, and P_c the size of the yield surface.  P_0 is the
+pressure at F = I, and e_v^p the plastic volume strain.  P and P_c follow the bilogarithmic law: ln v (v: specific
+volume) is linear in ln P, with the slope lambda in first loading, kappa in unloading.  The stress at the end of a step
+follows implicitly from the trial stresses P_t and Q_t, and from P_c,n at the start.  The plastic compaction is kappa a.
+The plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).

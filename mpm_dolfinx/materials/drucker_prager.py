@@ -7,9 +7,9 @@ The return to the yield surface
 
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
-with eta and xi from `MATCHES` and the accumulated plastic strain kappa, has the closed form of small strain, on the
-cone or at its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).  The consistent tangent is UFL's derivative of
-the stress.
+has the closed form of small strain, on the cone or at its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).
+`MATCHES` gives eta and xi; kappa is the accumulated plastic strain.  The consistent tangent is UFL's derivative of the
+stress.
 """
 
 from __future__ import annotations

@@ -6,10 +6,10 @@ stresses t_1 >= t_2 >= t_3, tension positive,
 
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
-flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along e_i, with principal directions e_i and
-the constants phi, psi, c and T of `MohrCoulomb`.  The return mapping keeps the order of the principal values.  The
-return therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric and Owen 2008, 8.2,
-without the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
+flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along e_i.  e_i are principal directions; phi,
+psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the principal values.  The return
+therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric and Owen 2008, 8.2, without
+the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
 admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the least violation is used;
 its violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
 """

@@ -108,8 +108,8 @@ class HeldCells:
     number, cell
         Index of the condition, and cell, of each penalty.
     x, shape, moments
-        Position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3, of each penalty;
-        for a penalty on a mean, these are means over its points.
+        Position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3, of each penalty.
+        For a penalty on a mean, the values are means over its points.
     stiffness
         Stiffness of each penalty and component, N/m.  Normal to a side parallel to the grid: from the confined modulus.
     limit : (2, k, d)

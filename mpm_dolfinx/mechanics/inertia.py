@@ -6,7 +6,7 @@ A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. Th
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
 The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`).  u and the
-motion u^ without forces are displacements since the start of the step; v_n is the velocity at this start, and v_1 and
+motion u^ without forces are displacements since the start of the step, and v_n is the velocity at this start.  v_1 and
 a_1 are velocity and acceleration of the previous substep.  Only velocities are carried from step to step.  In each step
 SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an oscillation of angular
 frequency omega.  This dissipation damps modes that the step cannot resolve.
@@ -16,12 +16,13 @@ centroids x_k,
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-with the shape functions N, the velocity gradient L, and the ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS on
-faces of cells that are not full (c: `GHOST_MASS`; h: cell size; [[d_n N]]: jump of the normal derivative). For an
-affine field G v_n vanishes, and M v_n is the right side. The transfer to the grid and back therefore conserves linear
-and angular momentum to rounding. A material point carries v and F', the rate of F; the velocity in its domain is v + F'
-F^-1 (x - x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky
-and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects this rule's error for rotations.
+with the shape functions N and the velocity gradient L. The ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS acts on
+faces of cells that are not full. Here c is `GHOST_MASS`, h the cell size, and [[d_n N]] the jump of the normal
+derivative. For an affine field G v_n vanishes, and M v_n is the right side. The transfer to the grid and back therefore
+conserves linear and angular momentum to rounding. A material point carries v and F', the rate of F; the velocity in its
+domain is v + F' F^-1 (x - x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass:
+Burgess, Sulsky and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects this rule's error
+for rotations.
 """
 
 from __future__ import annotations

@@ -394,8 +394,10 @@ class MomentumProblem:
 
     Parameters
     ----------
-    forms, system
-        Compiled forms; vectors and matrices, with assembled penalties.
+    forms
+        Compiled forms.
+    system
+        Vectors and matrices, with assembled penalties.
     data
         Integration points.
     loads
@@ -536,9 +538,9 @@ class MomentumProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two relative residuals of each connected part; r: residuals, N; scales (parts,): force scales, N.
 
-        For the first, the rounding error at each node is subtracted from the residual, but not with `first`, so that
-        even a load below this error causes a solve.  For the second, the force scale of a part is at least (rounding
-        error) / (tolerance), so that a residual as small as the rounding error counts as converged.
+        For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
+        subtracted, so that even a load below this error causes a solve.  For the second, the force scale of a part is
+        at least (rounding error) / (tolerance).  A residual as small as the rounding error then counts as converged.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

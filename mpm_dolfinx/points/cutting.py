@@ -194,10 +194,8 @@ def on_planes(
 
     Positions for slicing: in units of cells if all cells are equal, else in m, because domain edges are straight in m.
 
-    Parameters
-    ----------
-    true, x, axes
-        Positions from the grid's lower corner, in units of cells; the same from the base, m; array axis of components.
+    true: positions from the grid's lower corner, in units of cells; x, m: the same positions from the base; axes: array
+    axis of the components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim

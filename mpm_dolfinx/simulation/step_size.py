@@ -59,8 +59,10 @@ class StepSize:
 
     Parameters
     ----------
-    first, longest : s
-        First step; length of equal steps, or of the longest adaptive step.
+    first : s
+        First step.
+    longest : s
+        Length of equal steps, or of the longest adaptive step.
     rtol
         Tolerance of the pressure error, relative to the largest pressure change since the start of the run, or to the
         undrained pressure change of the step if that is larger; None for equal steps.

@@ -5,9 +5,9 @@
     [ B   C   ] [dp] = [R_p]
 
 K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES, preconditioned
-from the right with the upper block triangle, in which the fixed-stress operator P = C + beta V (fixed-stress
-coefficient beta, cell volumes V) replaces the Schur complement C + B K^-1 B^T. One multigrid cycle approximates K^-1,
-another one P^-1.
+from the right with the upper block triangle. In this triangle the fixed-stress operator P = C + beta V replaces the
+Schur complement C + B K^-1 B^T, with the fixed-stress coefficient beta and the cell volumes V. One multigrid cycle
+approximates K^-1, another one P^-1.
 
 In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods were slower; they were tested
 with algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15.  Conjugate gradients on the Schur complement
