@@ -116,7 +116,8 @@ class MixedCells:
             a, b = (piece[kept][rows] for rows in (one, other))
             overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
             overlap = overlap.clip(0) / np.maximum(high[a] - low[a], NEAR)
-            adjacent = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)  # deformed boxes may overlap: both count half
+            # deformed boxes may overlap: both count half
+            adjacent = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)
             counted = fraction + sum_by(one, adjacent * fraction[other] * overlap[:, axis], len(lines))
             out.append((lines, piece[kept], fraction / np.maximum(counted, 1.0)))
         return out
