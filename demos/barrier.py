@@ -7,8 +7,8 @@ neglected.  A viscous stress 2 eta D, a term in UFL, limits the velocity, and va
 adhesion of c / 2 stops the clay.
 
 After the slide the shear stress on any plane is at most c.  Consider a wedge of weight W between the wall and a plane
-of angle theta and length l through the foot of the wall.  The equilibrium of this wedge bounds the force F normal to
-the wall.  The shear force V on the wall is at most c D / 2, with D the depth of clay at the wall:
+through the foot of the wall, of inclination theta and length l.  The equilibrium of this wedge bounds the force F
+normal to the wall.  The shear force V on the wall is at most c D / 2, with D the depth of clay at the wall:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
@@ -81,7 +81,7 @@ class Frame:
 
 
 def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
-    """Return the active and the passive force, N/m, of the clay before the barrier, for its present strength."""
+    """Return the active and the passive force, N/m, of the clay in front of the barrier, for its present strength."""
     x, c = s.points.x, s.points.data["cohesion"][0]
     sin, cos, rubs = np.sin(ANGLES), np.cos(ANGLES), ADHESION * depth
     off = x[:, 1, None] * cos - (WALL - x[:, 0, None]) * sin  # (n, planes), m
@@ -138,7 +138,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=60, help="steps in which the cohesion is lost")
     o = parser.parse_args(argv)
     if not 5 <= o.cells <= 40 or o.cells % 5 or o.steps < 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be a multiple of 5 from 5 to 40, and >= 10")
+        parser.error(f"--cells {o.cells}: must be a multiple of 5 from 5 to 40; --steps {o.steps}: must be >= 10")
     with common.results(o) as out:
         free, held = slump(o.cells, o.steps, False), slump(o.cells, o.steps, True)
         before, end = held.frames[-2:]
@@ -157,13 +157,14 @@ def main(argv: list[str] | None = None) -> dict:
 
 def report(out: dict) -> None:
     """Print the results."""
-    print(f"run-out: {out['run_out']:.2f} m, with the barrier {out['held']:.3f} m; it stands at {WALL:g} m")
-    print(f"clay at the barrier: {out['depth']:.2f} m; its force acts at {out['arm']:.3f} of that")
+    print(f"run-out: {out['run_out']:.2f} m, with the barrier at {WALL:g} m {out['held']:.3f} m")
+    print(f"depth of the clay at the barrier: {out['depth']:.2f} m; height of the force / depth: {out['arm']:.3f}")
     kN = {name: out[name] / 1e3 for name in ("force", "most", "active", "passive")}
-    print(f"force at rest {kN['force']:.1f} kN/m, at most {kN['most']:.1f}; ", end="")
-    print(f"of wedges: active {kN['active']:.1f}, passive {kN['passive']:.0f} kN/m")
+    print(f"force on the barrier: final {kN['force']:.1f} kN/m, largest {kN['most']:.1f} kN/m; ", end="")
+    print(f"Coulomb's forces: active {kN['active']:.1f}, passive {kN['passive']:.0f} kN/m")
     liquid = WEIGHT * out["depth"] ** 2 / 2
-    print(f"over that of a liquid as deep: {out['force'] / liquid:.2f}; changes by {out['creep']:.0e} in the last step")
+    change = f"relative change in the last step: {out['creep']:.0e}"
+    print(f"final force / force of a liquid of the same depth: {out['force'] / liquid:.2f}; {change}")
 
 
 def draw(o: Namespace, free: Slump, held: Slump) -> None:
@@ -171,7 +172,7 @@ def draw(o: Namespace, free: Slump, held: Slump) -> None:
     fig, axes = common.figure(2, 2, (13, 6.6))
     meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
     shown = [
-        (axes[0, 0], held.frames[meets], f"it meets the barrier after {held.frames[meets].t / 60:.1f} minutes"),
+        (axes[0, 0], held.frames[meets], f"first contact after {held.frames[meets].t / 60:.1f} minutes"),
         (axes[0, 1], held.frames[-1], "at rest against the barrier"),
         (axes[1, 0], free.frames[-1], "at rest without a barrier"),
     ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cost of each feature of a scene, measured in a pair of scenes with and without it.
+"""Cost of each feature of a scene, measured with a pair of scenes, one with and one without this feature.
 
 A square block of 1 m between smooth walls carries a load so small that the active cells do not change.  In each pair
 one scene has no such feature, and in the other scene the feature has almost no effect.  Examples are a gravity of zero,
@@ -57,7 +57,10 @@ def block(
     grid: mpm.Grid | None = None,
     **options,
 ) -> mpm.Simulation:
-    """Return the block, `n` cells wide; the grid extends to `box`, m, by default two cells beyond the block."""
+    """Return the block, `cells` cells wide.
+
+    box: width of the grid, m; its height is larger by two cells.
+    """
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
     grid = grid or mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
@@ -126,7 +129,7 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with four layers of alternating conductivity, at an offset of cells from grid lines."""
+    """Return the draining block with four layers of alternating conductivity; off: offset from grid lines, in cells."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
@@ -138,14 +141,17 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """A skeleton for which pressure jumps are evaluated up to four times the flow that needs no damping."""
+    """A skeleton with a fourfold tau, so that pressure jumps are evaluated in `conducting`, but not damped."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block with 8 tau h² of flow in a substep; jumps are evaluated below 4, and damped below 1."""
+    """Return the draining block with a flow of 8 tau h² in a substep, with tau of Hencky's law.
+
+    Pressure jumps are evaluated if the flow is below 4 tau h² of the law, and damped if it is below tau h².
+    """
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
@@ -344,7 +350,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
     parser.add_argument("--quick", action="store_true", help="one pair of small blocks, one turn")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # of MAKES, in a process of its own
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # index in MAKES
     o = parser.parse_args(argv)
     if min(o.cells, o.repeat) < 1:
         parser.error(f"--cells {o.cells} --repeat {o.repeat}: must be >= 1")

@@ -44,11 +44,11 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""For each threshold: a scene by its cells along an axis, numbers of cells, and numbers of cells with --quick."""
+"""For each threshold: function from the number of cells along an axis to a scene; these numbers; those of --quick."""
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
-    """Return the time of the steps (s), the number of unknowns and the chosen solver, with another threshold."""
+    """Return the time of the steps (s), the number of unknowns and the chosen solvers; `least`: threshold `name`."""
     usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
     try:
         s = make(n)

@@ -45,7 +45,7 @@ PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", tractio
 
 @dataclass
 class Outcome:
-    """The axis of the beam (m, 2), m, at each alpha, from the middle of the clamp."""
+    """The axis of the beam (k, 2), m, at each alpha, from the middle of the clamp."""
 
     axis: dict[int, np.ndarray]
     result: mpm.Result
@@ -70,7 +70,7 @@ def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, floa
 
 
 def rod(alpha: float) -> np.ndarray:
-    """Return the axis of the rod (m, 2), m, at the arc lengths ARC."""
+    """Return the axis of the rod (k, 2), m, at the arc lengths ARC."""
     axial, transverse = YOUNG * HEIGHT, 5 / 6 * RUBBER.shear * HEIGHT
     return shear_flexible_rod(LENGTH, axial, transverse, STIFFNESS, -alpha * STIFFNESS / LENGTH**2, points=ARC)
 
@@ -88,7 +88,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=40, help="equal increments of the load to alpha = 10")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10 or o.steps % 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1, and a multiple of 10")
+        parser.error(f"--cells {o.cells}: must be >= 1; --steps {o.steps}: must be a multiple of 10")
     with common.results(o) as out:
         found, outcome = run(o.cells, o.steps)
         out |= {"errors": found, "wall_s": outcome.result.wall}

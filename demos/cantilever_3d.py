@@ -25,7 +25,7 @@ import common
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.grid.grid import corner_bits
 from mpm_dolfinx.verification.exact import shear_flexible_rod
 
 LENGTH, SIDE, YOUNG = 1.0, 0.1, 12e6  # m, m, Pa
@@ -83,7 +83,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces (m, 4, 3), m, of the body's domains, and the axial stretch of each."""
+    """Return the faces (k, 4, 3), m, of the body's domains, and the axial stretch of each."""
     (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):
@@ -105,7 +105,7 @@ def main(argv: list[str] | None = None) -> dict:
     add("--profile", action="store_true", help="print the run time of each part of the program")
     o = parser.parse_args(argv)
     if o.cells < 1 or min(o.steps) < 1 or not 0 < o.alpha <= 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps} --alpha {o.alpha}: must be >= 1, >= 1 and in (0, 10]")
+        parser.error(f"--cells {o.cells}, --steps {o.steps}: must be >= 1; --alpha {o.alpha}: must be in (0, 10]")
     with common.results(o) as out:
         out |= {"errors": {}, "runs": []}
         tips, picture = [], None

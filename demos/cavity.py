@@ -3,17 +3,18 @@
 
 The body is a quarter of a ring, with initial radius a0 of the cavity and outer radius b = 5 a0.  In each step the wall
 moves by a fifth of a cell, in undrained soil by a tenth.  Such small steps are needed because laws with history are
-first-order accurate in the step.  With eight cells and steps of a fifth of a cell, the radial solution itself has an
-error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
+first-order accurate in the step.  With eight cells and steps of a fifth of a cell, a radial solution in the same
+steps, without a grid, also has an error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
 1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, expanded so fast that no water flows.  The
    initial pressure acts on the outer boundary.  In incompressible soil the motion is exact: r^2 - a^2 = R^2 - a0^2.
 2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
 3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
    degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
-   outside of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
+   outer boundary of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
-Pressures are divided by p_0.  Errors are relative, at the radii `MARKS`.
+Pressures are divided by p_0.  Errors are relative: undrained at the radii `MARKS`, drained at the radii with published
+pressures.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, with lambda and kappa in terms of v and the Cauchy stress."""
+    """Return the clay of Chen and Abousleiman, with lambda and kappa converted from v and Cauchy stresses."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
@@ -52,8 +53,8 @@ def well() -> mpm.ModifiedCamClay:
 class Drained:
     """A drained cavity in infinite soil.
 
-    soil, state: the soil and its initial state variables; known: radius -> pressure divided by p_0; reach: outer radius
-    of the radial solution.
+    soil, state: the soil and its initial state variables; known: radius -> published pressure divided by p_0; reach:
+    outer radius of the radial solution.  Radii are divided by the initial radius of the cavity.
     """
 
     soil: mpm.Skeleton
@@ -186,7 +187,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation ratios, undrained")
     o = parser.parse_args(argv)
     if o.cells < 2 or any(not 1 <= ratio < 10 for ratio in o.ratios):
-        parser.error(f"--cells {o.cells} --ratios {o.ratios}: must be >= 2, and in [1, 10)")
+        parser.error(f"--cells {o.cells}: must be >= 2; --ratios {o.ratios}: must be in [1, 10)")
     with common.results(o) as out:
         out |= {"errors": {}, "balance": 0.0}
         dry, wet = {}, {}
@@ -194,7 +195,7 @@ def main(argv: list[str] | None = None) -> dict:
             dry[name] = drained(name, o.cells)
             for a, (p, radial) in dry[name].items():
                 out["errors"][f"{name}, a/a0 = {a}"] = p / DRAINED[name].known[a] - 1
-                known = f"known {DRAINED[name].known[a]:.3f}, radial {radial:.3f}"
+                known = f"published {DRAINED[name].known[a]:.3f}, radial solution {radial:.3f}"
                 print(f"{name}, a/a0 = {a}: {p:.3f} p0, {known}", flush=True)
         for ratio in o.ratios:
             run = wet[ratio] = push(ratio, o.cells)
@@ -204,7 +205,7 @@ def main(argv: list[str] | None = None) -> dict:
                 print(f"undrained clay, OCR {ratio:g}, a/a0 = {a}: {what} pressure {p:.4f} p0, exact {exact:.4f}")
             left = np.abs(run.profiles[-1][2]).max()
             out["balance"] = max(out["balance"], run.balance)
-            print(f"  consolidated: pore pressures up to {left:.1e} p0, fluid balance {run.balance:.0e}", flush=True)
+            print(f"  consolidated: pore pressures up to {left:.1e} p0; fluid balance {run.balance:.0e}", flush=True)
         worst = out["worst"] = max(map(abs, out["errors"].values()), default=0.0)
         out["converged"] = worst < 0.4 / o.cells and out["balance"] < 1e-6
         print(f"largest error {worst:.2%}")

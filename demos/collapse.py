@@ -3,14 +3,14 @@
 
 Columns of width L and height a L, a = 0.5, 1, 4 and 8, stand against a smooth wall on a rough floor.  Their right side
 is released suddenly.  Lube et al. (2005) measured sand, sugar and rice in a channel, with angles of repose near 31
-degrees.  The front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
+degrees.  In these experiments the front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
 
 The sand follows the Mohr-Coulomb law without dilation.  In simple shear its shear strength is sin phi times the normal
 stress (Davis 1968), so sin phi = tan 31 degrees.  In fast flow the friction coefficient grows by 0.93 I, with the
 inertial number I (Jop, Forterre and Pouliquen 2006).  For a grain size d = L/100 this is equivalent to a viscosity of
-0.93 d sqrt(p rho_s).  p is the pressure in the middle of a heap of half the height.  A constant viscosity is as good as
-a local viscosity (Ionescu et al. 2015).  Without viscosity, shear localises in single cells and dissipates energy
-numerically.  The front is the point at which the depth of the sand is one grain.
+0.93 d sqrt(p rho_s).  p is the pressure in the middle of a heap of half the height.  With a constant viscosity,
+run-outs are as accurate as with a local viscosity (Ionescu et al. 2015).  Without viscosity, shear localises in single
+cells and dissipates energy numerically.  The front is the point at which the depth of the sand is one grain.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011),
 J. Fluid Mech. 686, 378.
@@ -31,14 +31,16 @@ STIFF, COHESION = 200.0, 1e-3  # Young's modulus and cohesion, divided by rho g 
 GRAIN, RISE = 0.01, (0.64 - 0.38) / 0.279  # m; (mu_2 - mu_s) / I_0 of Jop et al.
 FALLS, SHOWN = 3.5, np.array([0.5, 1.0, 1.5, 2.0])  # duration, and times of the profiles, in units of sqrt(H/g)
 CELLS = {0.5: 12, 1.0: 8, 4.0: 4, 8.0: 4}  # cells over the width, for each aspect ratio
-SCATTER, BALANCE = 0.15, 0.02  # fraction of the experimental run-out; of the work of the weight
-STEPS = 50  # in sqrt(H/g)
+SCATTER, BALANCE = 0.15, 0.02  # allowed error of the run-out; of the energy balance / work of the weight
+STEPS = 50  # in the time sqrt(H/g)
 
 
 class Heap(NamedTuple):
-    """Run-out and height, m; energy loss and kinetic energy divided by the work of the weight; profiles; the run.
+    """Results for a column, run_out and height in m.
 
-    before, after: corners of the domains, m; profiles: middles of strips, m, and depths of sand in them, m.
+    lost: largest error of the energy balance; left: final kinetic energy; both divided by the work of the weight.
+    before, after: corners of the domains, m; profiles: middles of vertical strips, m, and depths of sand in the strips,
+    m.
     """
 
     run_out: float

@@ -42,9 +42,9 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
 
     def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
-        """Return the options; `takes` is the run time in the table Gallery of README.md, or None.
+        """Return the options, with the run time of the demo (s or min, as text) in `takes`.
 
-        The time (s or min) is known if the table contains this demo with the same options.
+        The time is that in the table Gallery of README.md; None if the table has no row with the same options.
         """
         args = sys.argv[1:] if args is None else list(args)
         o = super().parse_args(args, namespace)
@@ -78,7 +78,7 @@ def results(o: argparse.Namespace) -> Iterator[dict]:
         yield out
         out.setdefault("converged", True)
         if first() and not out["converged"]:
-            print("error: not within the bounds that the demo keeps with its usual options", file=sys.stderr)
+            print("error: results are outside the bounds that the demo checks", file=sys.stderr)
     except mpm.GaveUp as error:
         out |= {"wall_s": error.result.wall, "converged": False}
         if first():
@@ -96,7 +96,7 @@ def first() -> bool:
 
 
 def whole(s: mpm.Simulation, *names: str) -> list[np.ndarray]:
-    """Return named fields of the points of all processes, ordered by the points' numbers."""
+    """Return named fields of the points of all processes, ordered by the identifiers of the points."""
     parts = s.grid.comm.allgather([getattr(s.points, name) for name in ("id", *names)])
     ids, *values = map(np.concatenate, zip(*parts, strict=True))
     return [each[np.argsort(ids)] for each in values]
@@ -118,7 +118,7 @@ def markdown(rows: Iterable[Iterable[str]]) -> str:
 
 
 def write_csv(path: Path, head: Iterable[str], rows: Iterable[Iterable]) -> None:
-    """Write a table as CSV."""
+    """Write a table as a CSV file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         csv.writer(file).writerows([head, *rows])

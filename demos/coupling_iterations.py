@@ -6,11 +6,12 @@ beam, undeformed and bent) and a footing on a column.  Only the product of condu
 product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the water ranges from
 1e4 Pa to infinity.
 
-Three schemes are compared.  The package uses conjugate gradients on the Schur complement, S = C + B K^-1 B^T. The
-preconditioner is the filtered fixed-stress operator C + beta (V - 3/4 L).  The second scheme uses the plain operator, C
-+ beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson) iteration, with beta = 0.5, 0.75
-and 1 times alpha²/K_dr.  With beta = 1/K_w this iteration diverges.  An iteration consists of one solve of the storage
-and one solve of the momentum.
+Three schemes are compared.  The package uses conjugate gradients on the Schur complement S = C + B K^-1 B^T, with the
+matrices C of storage and flow, K of stiffness, and B of coupling.  The preconditioner is the filtered fixed-stress
+operator C + beta (V - 3/4 L), with the cell volumes V and a five-point Laplacian L.  The second scheme uses the plain
+operator, C + beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson) iteration, with beta =
+0.5, 0.75 and 1 times alpha²/K_dr.  With beta = 1/K_w this iteration diverges.  An iteration consists of one solve of
+the storage and one solve of the momentum.
 
 Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
 limits these modes, and thereby also the number of iterations.  The second picture shows the pressure with and without
@@ -37,7 +38,7 @@ from mpm_dolfinx.stepping import step
 from mpm_dolfinx.stepping.balances import balances
 
 K_DT = np.array([-23, -16, -12, -10, -9, -8, -7, -6, -5, -4, -3, -2, 0, 3, 7, 11])  # log10 of k dt in m
-BULK = (1e4, 1e6, 2.2e9, np.inf)  # of the water, Pa
+BULK = (1e4, 1e6, 2.2e9, np.inf)  # bulk modulus of the water, Pa
 SCHEMES = {
     "Schur-CG": ("cg", 0.75, FILTER),
     "Schur-CG, plain operator": ("cg", 0.75, 0.0),
@@ -87,7 +88,7 @@ def cantilever(h: float) -> mpm.Simulation:
 
 
 def bent(h: float) -> mpm.Simulation:
-    """Return the poroelastic beam after two steps, with a tip deflection of half its height."""
+    """Return the poroelastic beam after two steps, when its tip has sagged by half the height of the beam."""
     simulation = cantilever(h)
     simulation.run(2 * RAMP_STEP, RAMP_STEP, progress=False)
     return simulation

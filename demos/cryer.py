@@ -3,9 +3,9 @@
 
 A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained.  The outer shell
 drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
-falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this.  Fluid and grains are incompressible,
-nu = 0.25.  One octant is computed, a lattice of boxes mapped smoothly into the sphere; with --axisymmetric, a quarter
-of a disc.
+falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this rise.  Fluid and grains are incompressible,
+nu = 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a quarter
+of a disc is computed.
 
 Errors of the pressure at the centre, with the reduced time T = c_v t / R²: `peak` is the relative error of the largest
 pressure; `curve` is the largest error from T = 0.02 on, divided by p0.
@@ -64,7 +64,7 @@ def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
 
 @dataclass
 class Outcome:
-    """Reduced times (m,), pressures at the centre divided by p0 (m,), and the cost of the run."""
+    """Reduced times (k,), pressures at the centre divided by p0 (k,), and the cost of the run."""
 
     T: np.ndarray
     pressure: np.ndarray
@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--profile", action="store_true", help="print the run time of each part of the program")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.steps < 1:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 2 and >= 1")
+        parser.error(f"--cells {o.cells}: must be >= 2; --steps {o.steps}: must be >= 1")
     with common.results(o) as out:
         found, outcome = run(o.cells, o.steps, o.axisymmetric)
         result = outcome.result

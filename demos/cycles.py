@@ -2,8 +2,8 @@
 """Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
 The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly.  The beam is elastic, so its stress must
-vanish after unloading.  Displacements of the grid have kinks at grid lines.  Domains that follow these kinks would
-accumulate stress with every grid line that they cross, like the points of standard MPM.
+vanish after unloading.  Displacements of the grid have kinks at grid lines.  Domains that followed these kinks
+would accumulate stress with every grid line that they cross, as points of standard MPM do.
 
 A block is stretched between two fixed sides and then rotated by 360 degrees.  Its final stresses must equal the
 stresses before the rotation.
@@ -32,7 +32,7 @@ STRETCH = 0.1  # stretch of the block before its rotation
 BLOCK = 1.0  # m
 AWAY = 0.1  # m: distance from the wall without influence of the singular edges
 SPRINGS = 5e7  # Pa/m: springs instead of the clamp, as stiff as a third of the beam, without singularity
-COLORS = ("C1", "C0", "C2", "C4", "C5")  # of the cell sizes
+COLORS = ("C1", "C0", "C2", "C4", "C5")  # one for each cell size
 
 
 def options(h: float, load: float, quadrature: str = "domain") -> Namespace:
@@ -48,7 +48,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the rms stress of the points, Pa, with zero for points nearer to the wall than `away`, m."""
+    """Return the rms stress of the points, Pa; stresses nearer to the wall than `away`, m, count as zero."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -84,12 +84,12 @@ def cycle(
     fluid
         Pore fluid; the beam is undrained.
     springs
-        Stiffness, Pa/m, of springs along the wall that support the beam in place of the clamp.  It is largest in the
-        middle and zero at the edges, so that no stress is singular.
+        Largest stiffness, Pa/m, of springs along the wall that support the beam in place of the clamp.  The stiffness
+        decreases from the middle to zero at the edges, so that no stress is singular.
 
     Returns
     -------
-    left: rms stress after each cycle, divided by that at the first peak; away: the same without points
+    left: rms stress after each cycle, divided by the rms stress at the first peak; away: the same without points
     near the wall; times, tips (m): time and tip deflection of each step; lost: work of the load in each cycle, divided
     by the work up to the first peak; volume: volume change of the beam minus that of its water; balance: error of the
     fluid balance.
@@ -212,7 +212,7 @@ def main(argv: list[str] | None = None) -> dict:
     if not 0 < len(o.h) <= len(COLORS):
         parser.error(f"--h: {len(o.h)} cell sizes, must be 1 to {len(COLORS)}")
     if o.steps < 2 or o.steps % 2 or o.cycles < 1:
-        parser.error(f"--steps {o.steps} --cycles {o.cycles}: must be even and >= 2, and >= 1")
+        parser.error(f"--steps {o.steps}: must be even and >= 2; --cycles {o.cycles}: must be >= 1")
     with common.results(o) as out:
         runs = {h: cycle(h, o.load, o.cycles, o.steps) for h in o.h}
         points = cycle(o.h[-1], o.load, o.cycles, o.steps, "point")
@@ -224,8 +224,8 @@ def main(argv: list[str] | None = None) -> dict:
         wet = [cycle(h, o.load, o.undrained, o.steps, **sealed) for h in sizes]
         sprung = [cycle(h, o.load, o.undrained, o.steps, springs=SPRINGS, **sealed) for h in sizes]
 
-        lines = [["", "stress left / peak", "work lost a cycle", "drift of the peaks", "tip without load"]]
-        rows = {f"h = {h:g} m": run for h, run in runs.items()} | {f"at points, {o.h[-1]:g} m": points}
+        lines = [["", "residual stress / peak", "work lost in a cycle", "drift of the peaks", "tip without load"]]
+        rows = {f"h = {h:g} m": run for h, run in runs.items()} | {f"standard MPM, {o.h[-1]:g} m": points}
         for name, run in rows.items():
             peaks, rest = run["tips"][o.steps // 2 :: o.steps], run["tips"][:: o.steps]
             numbers = (run["left"][-1], run["lost"][-1], peaks[-1] / peaks[0] - 1, rest[-1] / peaks[0])
@@ -237,17 +237,17 @@ def main(argv: list[str] | None = None) -> dict:
         last["near"] = np.sqrt(np.square(last["undrained"]) - np.square(last["away"])).tolist()
         order = {name: orders(o.h, left) for name, left in last.items()}
         what = {"drained": f"drained, {o.cycles} cycles", "undrained": f"undrained, {o.undrained} cycles"}
-        what |= {"away": "the same but at the clamp", "near": "at the clamp alone"}
-        what["springs"] = "undrained, held by springs"
+        what |= {"away": "the same without the region at the clamp", "near": "the region at the clamp alone"}
+        what["springs"] = "undrained, on springs instead of the clamp"
         for name, left in last.items():
             numbers = ", ".join(f"{x:.4%}" for x in left)
-            steps = ", of order " + ", ".join(f"{x:.2f}" for x in order[name]) if order[name] else ""
-            print(f"{what[name]}: stress left {numbers}{steps}")
+            steps = "; orders of convergence " + ", ".join(f"{x:.2f}" for x in order[name]) if order[name] else ""
+            print(f"{what[name]}: residual stress / peak {numbers}{steps}")
         for h, run in zip(sizes, wet, strict=True):
-            print(f"undrained, h = {h:g} m: volume {run['volume']:.1e}, fluid balance {run['balance']:.1e}")
+            print(f"undrained, h = {h:g} m: errors of volume {run['volume']:.1e}, fluid balance {run['balance']:.1e}")
         for what, changes in (("", turned), (" undrained", undrained)):
             for h, change in changes.items():
-                print(f"turned by 360 degrees{what}, h = {h:g} m: the stress in the middle changes by {change:.4%}")
+                print(f"rotated by 360 degrees{what}, h = {h:g} m: the stress in the middle changes by {change:.4%}")
         columns = [*(run["left"] for run in runs.values()), points["left"]]
         numbers = ([k + 1, *(c[k] if k < len(c) else "" for c in columns)] for k in range(o.cycles))
         common.write_csv(o.out / "cycles.csv", ["cycle", *(f"left_h_{h:g}" for h in o.h), "left_at_points"], numbers)
@@ -268,8 +268,8 @@ def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndar
         left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")
     label = f"standard MPM, h = {o.h[-1]:g} m"
     left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="C3", label=label)
-    left.set(xlabel="cycles", ylabel="stress left at zero load / at the peak", xscale="log", yscale="log")
-    left.set_title("What is left of the stress")
+    left.set(xlabel="cycles", ylabel="rms stress at zero load / at the peak load", xscale="log", yscale="log")
+    left.set_title("Residual stress")
     last = runs[o.h[-1]]
     both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "C3")
     for name, run, style, color in both:

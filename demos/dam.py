@@ -2,7 +2,7 @@
 """Seepage with a free surface through a dam of unsaturated soil, while the level of the reservoir falls.
 
 A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
-reservoir, 5 m.  Then the slope away from the reservoir becomes permeable, and the flow becomes steady.  After that the
+reservoir, 5 m.  Then the downstream slope becomes permeable, and the flow becomes steady.  After that the
 level of the reservoir falls by 2 m in five days, and the free surface, p = 0, follows as the soil drains.  Above the
 free surface water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the slope on its side.
 Above this water, both slopes are seepage faces.
@@ -72,7 +72,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, m, with `steps` equal steps of each length in `SETTLES`, and in the drawdown."""
+    """Run the dam on cells of size h, m, with `steps` equal steps in each period of `SETTLES`, and in the drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -137,7 +137,10 @@ def rectangular(cells: int) -> float:
 
 
 def driving(level: float, top: float) -> float:
-    """Return the integral of Kirchhoff's potential over a hydrostatic side, m^2; level, top: of water and dam, m."""
+    """Return the integral of Kirchhoff's potential over a hydrostatic side, m^2.
+
+    level: height of the water, m.  top: height of the dam, m.
+    """
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
     k_r = filled**law.l * (1 - (suction * WEIGHT / law.entry) ** (law.n - 1) * filled) ** 2
@@ -147,7 +150,7 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow, m, of a column of 10 m: from `cells` cells, and from finite elements on four times as many.
+    """Return the outflow, m, of a column of 10 m: by `cells` cells, and by finite elements on four times as many cells.
 
     Initially the free surface is at 8 m; then the head at the base is 2 m.
     """
@@ -159,7 +162,8 @@ def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
     simulation = mpm.Simulation(grid, [body], [LOAM], gravity=(0, -9.81), initial_stress=mpm.K0(0.5), **scene)
     start = simulation.cells().water.sum()
     simulation.run(days * DAY, days * DAY / 50, progress=False)
-    hard = replace(LOAM, bulk=1e12, shear=5e11)  # it has no stress at first, against its weight
+    # stiff elements: they start without stress, under their weight
+    hard = replace(LOAM, bulk=1e12, shear=5e11)
     fem = BiotFEM([0, 0], [h, 10], [1, 4 * cells], hard, gravity=lambda t: (0, -9.81), element="q1-dg0", **scene)
     full = fem.water()
     fem.run(days * DAY, days * DAY / 100, probes=[[0, 10]])
@@ -176,7 +180,8 @@ def main(argv: list[str] | None = None) -> dict:
     )
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1 or not 10 <= o.cells <= 200:
-        parser.error(f"--h {o.h} --steps {o.steps} --cells {o.cells}: must be 0.1 to 1 m, >= 1, and 10 to 200")
+        h, steps = f"--h {o.h}: must be 0.1 to 1 m", f"--steps {o.steps}: must be >= 1"
+        parser.error(f"{h}; {steps}; --cells {o.cells}: must be 10 to 200")
     with common.results(o) as out:
         flow = rectangular(o.cells)
         print(f"rectangular dam, {o.cells} cells high: flow over the exact one {flow:.4f}", flush=True)

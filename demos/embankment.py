@@ -114,7 +114,7 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
             dt = (end - simulation.t) / count
             result = simulation.run(end, dt, probes=probes, observe=observe, progress=False)
             out.wall, out.steps = out.wall + result.wall, out.steps + result.steps
-            if last and part != 1:  # just after the last lift, and in the end
+            if last and part != 1:  # just after the last lift, and at the end
                 points = simulation.points
                 title = f"{simulation.t / DAY:.0f} days after the first lift"
                 out.frames.append((title, points.corners.copy(), points.pressure))
@@ -133,14 +133,14 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=6, help="steps between two lifts")
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1:
-        parser.error(f"--h {o.h} --steps {o.steps}: must be between 0.1 and 1 m, and >= 1")
+        parser.error(f"--h {o.h}: must be 0.1 to 1 m; --steps {o.steps}: must be >= 1")
     with common.results(o) as out:
         bund = run(o.h, o.steps)
         out |= {"carried": bund.carried, "settlement": -bund.axis[-1], "wall_s": bund.wall}
         print(f"the clay's lowest points carry {bund.carried:.4f} of the weight of the lifts")
         print(f"settlement on the axis: {-bund.axis[-1]:.3f} m, at the toe {-bund.toe[-1]:.3f} m")
         most, end = max(bund.excess) / 1e3, bund.excess[-1] / 1e3
-        print(f"excess pressure in mid-clay: {most:.1f} kPa at most, {end:.2f} at the end")
+        print(f"excess pressure in the middle of the clay: {most:.1f} kPa at most, {end:.2f} kPa at the end")
         draw(o, bund)
         print(f"{bund.steps} steps, {bund.wall:.1f} s")
     return out

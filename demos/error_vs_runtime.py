@@ -10,9 +10,9 @@ are separate.  Reference solutions are converged in space and in time.
   0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
 * drained: the same beam without water, loaded in ten steps; error of the tip deflection against 67 x 20 Taylor-Hood
   elements
-* terzaghi: error of the settlement at T_v = 0.5, against the exact one
-* mandel: error of the settlement of the plate at T = 0.1, against the exact one
-* column: error of the height of the soft column under its own weight, against the exact one
+* terzaghi: error of the settlement at T_v = 0.5, against the exact settlement
+* mandel: error of the settlement of the plate at T = 0.1, against the exact settlement
+* column: error of the height of the soft column under its own weight, against the exact height
 """
 
 from __future__ import annotations
@@ -124,9 +124,11 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of a box; exact: displacement of its top, m; width: cells, -1: as the height.
+    """Yield (method, setting, run) of a box, first for all cell sizes, then for all numbers of steps.
 
-    time: end (s) and number of steps of the sweep over the cells; steps: numbers of steps of the sweep over time.
+    width: number of cells over the width, or -1 for as many as over the height.  time: end time, s, and number of steps
+    for all cell sizes.  exact: displacement of the top, m.  cells: numbers of cells over the height.  steps: numbers of
+    steps, on the finest cells.
     """
 
     def points(n: int, m: int, rtol: float | None = None, **options) -> Run:
@@ -245,7 +247,7 @@ def time_at(rows: list[Row], error: float) -> float:
 
 
 def compare(rows: list[Row]) -> list[dict]:
-    """Return errors and time ratios of default runs, relative to finite elements on equal cells and at equal error."""
+    """Compare default runs with Q1/DG0 elements: errors and times on equal cells, and times at equal error."""
     out = []
     for r in (r for r in rows if r.method == DEFAULT):
         peers = [q for q in rows if q.case == r.case and q.method == PEER]

@@ -8,9 +8,10 @@ mapping in numpy.  The parameter names of a user function select its arguments. 
 `materials/user_functions.py` of the package list them.
 
 The error is the largest difference from the exact solution, divided by the largest exact value.  With 20 cells it is
-8e-4 and 6e-4 for energy and fibres (layers are stretched in a single step), 3e-3 for both conductivities, 6e-4 for the
-foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error of the damage is 1e-5, because
-its prescribed top gives way a little.  Plastic flow, the implicit stress and the return mapping have errors of 1e-11.
+8e-4 for the energy and 6e-4 for the fibres (these layers are stretched in a single step), 3e-3 for both conductivities,
+6e-4 for the foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error of the damage is
+1e-5, because the penalty of the prescribed displacement lets the top move a little.  Plastic flow has an error of
+1e-11; the implicit stress and the return mapping have errors of 1e-15.
 """
 
 from __future__ import annotations
@@ -79,7 +80,10 @@ def stretch(stress: Callable[[float], float]) -> float:
 
 
 def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
-    """Return labels and values of an `Example`: displacements of the points; stretches: of four layers, exact."""
+    """Return labels and values of an `Example`: displacements of the points.
+
+    stretches: exact stretches of four layers, from below.
+    """
     Y, u = displacements(s)
     exact = np.interp(Y, np.linspace(0, 1, 5), np.concatenate([[0], np.cumsum(stretches - 1) / 4]))
     return "height at the start (m)", "displacement (m)", Y, u, exact
@@ -98,7 +102,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2); in each quarter of the height it is twice that above."""
+    """Return a modulus, Pa, at reference positions (n, 2); each quarter of the height has twice that above."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 
@@ -116,7 +120,7 @@ def energy(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Fibrous(mpm.NeoHookean):
-    """Neo-Hookean matrix with fibres: + c/4 (I_4 - 1)^2, I_4 = |F a|^2, a the direction of the fibres."""
+    """Neo-Hookean matrix with fibres of direction a, which add the energy c/4 (I_4 - 1)^2 with I_4 = |F a|^2."""
 
     fibre: float = 0.0  # c, Pa
     direction: mpm.Field = (1.0, 0.0)
@@ -387,7 +391,7 @@ def draw(o: Namespace, examples: list[Example]) -> None:
         ax.locator_params(nbins=4)
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
-    fig.suptitle("Physics of one's own, and its largest error")
+    fig.suptitle("User-defined physics: largest error of each example")
     common.save(fig, o.out / "extending_with_ufl.png")
 
 

@@ -4,16 +4,17 @@
 Every scene is tiny and has one extreme property.  Scenes with the same extreme property form a family.  Each scene has
 one of these outcomes:
 
-* converged: the error against an exact solution, finite elements, or the same scene with a moderate setting is below
-  the bound of its family.  Both residuals and the error of the fluid balance are below 1e-8;
+* converged: the error is below the bound of the family.  The reference is an exact solution, a solution with finite
+  elements, or the same scene with a moderate setting.  Both residuals and the error of the fluid balance are below
+  1e-8;
 * recovered: converged, but some steps were cut;
 * refused: the run ends with an error that gives the reason, as it must in a scene without equilibrium;
 * warned: the error is above the bound, and the package has issued a warning;
 * wrong, nan or hung: a defect, which the exit status reports.
 
-An error is relative to the largest exact value, unless its family defines another one.  The condition number refers to
-the last tangent of the momentum balance, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.  On
-one process.
+An error is divided by the largest exact value, unless the docstring of its family defines the error otherwise.  The
+condition number refers to the last tangent of the momentum balance, scaled to a unit diagonal.  Unexpected
+exceptions also count as wrong.  On one process.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from scipy.sparse import csr_matrix
 
 import mpm_dolfinx as mpm
 
-LIMIT = 100  # s of processor time for a case, so that other work on the machine does not count
-CLOSED = 1e-8  # residuals and fluid balance
+LIMIT = 100  # s, for a case; processor time, so that other work on the machine does not count
+CLOSED = 1e-8  # bound of the residuals and of the error of the fluid balance
 SHOWN = {
     "fluid-bulk": "water's bulk modulus",
     "poisson": "Poisson's ratio",
@@ -43,7 +44,7 @@ SHOWN = {
     "combined": "conductivity and step",
     "filling": "nearly empty cells",
     "thin": "thin beams",
-}  # in the picture, beside names that need no other
+}  # labels in the picture; other families have their names as labels
 OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung")
 
 
@@ -159,7 +160,7 @@ def summary(rows: list[Row]) -> str:
             lines.append(
                 [name, f.cases.__doc__.splitlines()[0].rstrip("."), f.bound, *(count[n] for n in OUTCOMES), *figures]
             )
-    return table(["family", "what, and its reference", "bound", *OUTCOMES, *(f"worst {n}" for n in names)], lines)
+    return table(["family", "property, and reference", "bound", *OUTCOMES, *(f"worst {n}" for n in names)], lines)
 
 
 def write(out: Path, rows: list[Row]) -> None:
@@ -207,7 +208,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="four cases of each family, the first and last among them")
-    parser.add_argument("--rtol", type=float, help="choose the steps by their error, none longer than the scene's")
+    parser.add_argument("--rtol", type=float, help="tolerance of adaptive steps, at most as long as the equal steps")
     o = parser.parse_args(argv)
     with common.results(o) as out:
         rows = []

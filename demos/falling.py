@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A box slides, a ball rolls and a second ball bounces down an incline, compared with the motion of rigid bodies.
 
-The incline, 30 degrees to the grid, is rough, mu = 0.3.  b is its angle.  A rigid box slides by (sin b - mu cos b) g
+The rough incline, mu = 0.3, has an angle of b = 30 degrees to the grid.  A rigid box slides by (sin b - mu cos b) g
 t^2 / 2 in the time t.  A rigid disc rolls by sin b g t^2 / 3, if mu > tan b / 3.  Another disc falls on the incline
 from a height of its own radius.  After the impact it bounces and rotates.  Box and discs are stiff rubber, and touch
 the incline only, not each other.  The final energy is the work of gravity, minus the energy that friction and elastic
@@ -50,7 +50,10 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 
 
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
-    """Release the bodies; return the result, time, s, and three centres, m, as rows (times, 7), and some corners."""
+    """Release the bodies; return the result, rows (times, 7), and corners of the domains, m, at some times.
+
+    Each row has the time, s, and the positions (x, y), m, of three centres of mass.
+    """
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []
 
@@ -72,7 +75,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--dt", type=float, default=0.005, help="step, s")
     o = parser.parse_args(argv)
     if o.cells < 3 or not 1e-4 <= o.dt <= 0.05:
-        parser.error(f"--cells {o.cells} --dt {o.dt:g}: must be >= 3, in [1e-4, 0.05]")
+        parser.error(f"--cells {o.cells}: must be >= 3; --dt {o.dt:g}: must be in [1e-4, 0.05]")
     with common.results(o) as out:
         s, parts = scene(o.cells)
         result, rows, shapes = fall(s, parts, o.dt)
@@ -90,11 +93,10 @@ def main(argv: list[str] | None = None) -> dict:
         total = sum(e[name] for name in ("kinetic", "elastic", "dissipated", "friction")) - e["external"]
         out["energy"] = float(np.abs(total - total[0]).max() / e["external"][-1])
         out["friction"] = float(e["friction"][-1] / e["external"][-1])
-        print(f"way of the box {out['slides']:+.2%}, of the ball that rolls {out['rolls']:+.2%} beside rigid ones")
-        print(f"the one that falls comes back to {out['height']:.0%} of its height; flight off by {out['flies']:.2%}")
-        print(
-            f"energies are off by {out['energy']:.2%} of the work of the weight; friction takes {out['friction']:.0%}"
-        )
+        print(f"error of the distance: sliding box {out['slides']:+.2%}, rolling ball {out['rolls']:+.2%}")
+        print(f"falling ball: rebounds to {out['height']:.0%} of its height; error of the flight {out['flies']:.2%}")
+        balance = f"energy balance {out['energy']:.2%}, friction {out['friction']:.0%}"
+        print(f"relative to the work of the weight: error of the {balance}")
         within = all(abs(out[name]) <= most for name, most in BOUNDS.items())
         out["converged"] = within or (o.cells, o.dt) != (5, 0.005)
         draw(o, result, t, way, above, shapes, rigid)

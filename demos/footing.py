@@ -3,8 +3,8 @@
 
 B is the width of the footing, which is rough and rigid.  By symmetry half of it is computed, as a prescribed
 displacement on a part of the soil's top.  The soil is a weightless layer 2.5 B thick on rough rock.  It follows Drucker
-and Prager's law with cohesion c, and drains at its free top.  The velocity v of the footing is given by V = v B / c_v,
-with the coefficient of consolidation c_v.
+and Prager's law with cohesion c, and drains at its free top.  V = v B / c_v is the dimensionless velocity
+of the footing, with its velocity v and the coefficient of consolidation c_v.
 
 A smooth, impervious wall bounds the soil at 8 B from the middle of the footing.  With a wall at 16 B, loads change by
 less than 1 % at any depth and rate; the demo shows this on coarser cells.  With a wall at 4 B, drained loads are up to
@@ -20,14 +20,15 @@ In the deep push the soil does not dilate.  Its undrained strength is s_u = xi c
 0.27 sqrt(D/B)) times the undrained load of a footing at the surface (fit to bounds of limit analysis, Salgado et al.
 2004). The drained capacity at the surface lies between the capacity for the reduced friction of Davis (1968) and c N_c.
 
-The undrained limit load converges from below, with order 1.5: its error is -6.7, -2.9, -1.1 % with 5, 9, 17 cells. The
-outermost node of the footing also carries half a cell beyond it, so an odd number of cells represents the true width.
-With 4, 8, 16 cells this node lies at the edge, and the footing is effectively wider by half a cell on each side.
+The undrained limit load converges from below, with order 1.5: its error is -5.9, -2.4, -0.85 % with 5, 9, 17 cells. The
+outermost node of the footing also carries the half cell outside this node.  With an odd number of cells the effective
+width is therefore the true width.  With 4, 8, 16 cells this node lies at the edge of the footing, and the effective
+width is larger by half a cell on each side.
 
 In associated flow the dilation of each point is proportional to its shear, but a cell has one mean dilatation.  The
-load would therefore increase without limit (de Borst and Groen 1995); its error in this demo would be +4.4 and +3.4 %
-with 9 and 17 cells.  In fully yielding cells, laws therefore use half of the deviation of the gradient from its mean.
-This reduces the error to -1.0, +0.2, +0.8 % with 5, 9, 17 cells.
+load would therefore increase without limit (de Borst and Groen 1995); in this demo the error of the load would be +4.4
+and +3.4 % with 9 and 17 cells.  In fully yielding cells, laws therefore use half of the deviation of the gradient from
+its mean.  This reduces the error to -0.5, +0.5, +0.9 % with 5, 9, 17 cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
@@ -66,7 +67,7 @@ SOIL = mpm.DruckerPrager(
 WATER = mpm.Fluid()
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-3}  # V
-COLOURS = ("C0", "C1", "C2")  # of the rates
+COLOURS = ("C0", "C1", "C2")  # one for each rate
 STEP = 1 / 14  # fraction of a cell that the footing moves in a step
 BOX = (8.0, 2.5)  # width and height of half the soil, divided by B
 COARSE = 5  # largest number of cells over the width, in runs with a box twice as wide
@@ -76,7 +77,8 @@ LIMITS_OF = {  # for limit loads: depth divided by B, box
     "drained": (0.003, (4.0, 1.7)),
     "circular": (0.0012, (2.0, 1.2)),
 }
-NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box, over B; ratios of neighbouring and extreme cells
+NEAR = (1.0, 0.75)  # size of the computed half of the fine region, divided by B
+RATIO, LARGEST = 1.1, 8  # ratio of the sizes of neighbouring cells; of the largest and the smallest cells
 FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil, divided by B
 ROUND = 6.05  # limit load of a rough circular footing, divided by area and s_u
 
@@ -87,7 +89,7 @@ def capacity(friction: float) -> float:
     return 2 + np.pi if t == 0 else (np.exp(np.pi * t) * np.tan(np.pi / 4 + np.radians(friction) / 2) ** 2 - 1) / t
 
 
-SURFACE = {  # loads divided by B c; Davis: tan phi* = sin phi of the same strength in plane strain
+SURFACE = {  # limit loads divided by B c; Davis: reduced friction phi*, tan phi* = sin phi, in plane strain
     "undrained": SOIL.xi * capacity(0.0),
     "drained, Davis": SOIL.xi * capacity(np.degrees(np.arctan(SOIL.eta))),
     "drained, associated": capacity(FRICTION),
@@ -104,7 +106,7 @@ class Frame:
     """State of footing and soil at one time of a push.
 
     t: time divided by the duration of the push.  settlement: divided by B.  corners (n, 4, 2), m, and pore pressure
-    (n,), Pa, of the domains.  top (m, 2): positions of the soil's surface, from the middle outward, m.
+    (n,), Pa, of the domains.  top (k, 2): positions of the soil's surface, from the middle outward, m.
     """
 
     t: float
@@ -118,9 +120,9 @@ class Frame:
 class Push:
     """Results of a push.
 
-    settlement, load: after each step, divided by B and by B c.  frames: states at some times.  pushed: index of the
-    last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the initial
-    surface of the soil.
+    settlement, load: settlement / B and load / (B c) after each step.  frames: states at some times.  pushed: index of
+    the last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the
+    initial surface of the soil.
     """
 
     settlement: list[float] = field(default_factory=lambda: [0.0])
@@ -171,7 +173,8 @@ def push(
         grid = mpm.Grid(lines=lines, axisymmetric=circular)
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
-    under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
+    # the drained part of the top begins at the outermost node of the footing
+    under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under, name="footing")
     sides, water = [footing], {}
     if rate:
@@ -183,7 +186,7 @@ def push(
 
     def observe(s: mpm.Simulation) -> None:
         out.settlement.append(depth * min(1, s.t / end))
-        area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # of half of the strip
+        area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # m^2: disc, or half of the strip
         out.load.append(-s.reactions["footing"][1] / (area * COHESION))
         if len(out.load) % 5 == 0 or s.result.converged:
             corners, pressure = common.whole(s, "corners", "pressure")
@@ -237,9 +240,9 @@ def main(argv: list[str] | None = None) -> dict:
     if o.graded and (o.steps, o.depth) != (None, 1.0):
         parser.error("--graded: must go without --steps and --depth")
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
-        parser.error(f"--cells {o.cells} --depth {o.depth:g}: must be odd and >= 3, and in (0, 1.5]")
+        parser.error(f"--cells {o.cells}: must be odd and >= 3; --depth {o.depth:g}: must be in (0, 1.5]")
     if o.steps is not None and (o.steps < 1 or not 1 <= o.box <= 32):
-        parser.error(f"--steps {o.steps} --box {o.box:g}: must be >= 1, and in [1, 32]")
+        parser.error(f"--steps {o.steps}: must be >= 1; --box {o.box:g}: must be in [1, 32]")
     if not 0 <= o.viscosity <= 1:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
     if o.steps is None and (o.box, o.method, o.viscosity) != (BOX[0], methods[0], 0.0):
@@ -309,7 +312,7 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
     """
     if viscosity == 0:
         return SOIL
-    own = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)} | {"residual": COHESION, "slip": WIDTH}  # none softens
+    own = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)} | {"residual": COHESION, "slip": WIDTH}  # no softening
     return mpm.SofteningDruckerPrager(**own, viscosity=viscosity * COHESION * seconds)
 
 
@@ -372,12 +375,12 @@ def report(runs: dict[str, Push]) -> dict:
         print(
             f"{name:>12}, V = {RATES[name]:<5g}: q/c {found['load']:.2f}, p up to {found['pressure']:.2g} c, "
             f"heave {found['heave']:.2f} B, fluid balance {found['balance']:.0e}, {found['steps']} steps, "
-            f"{found['cuts']} cuts, {found['rederived']} domains re-derived, {found['wall']:.0f} s"
+            f"{found['cuts']} cuts, {found['rederived']} inverted domains, {found['wall']:.0f} s"
         )
     at_rest, depth = runs["intermediate"], runs["fast"].settlement[-1]
     left = np.abs(at_rest.frames[-1].pressure).max() / COHESION
     out["fast_over_embedded"] = out["fast"]["load"] / embedded(depth) - 1
-    print(f"the intermediate push at rest, consolidated: q/c {at_rest.load[-1]:.2f}, p down to {left:.2g} c")
+    print(f"consolidated after the intermediate push: q/c {at_rest.load[-1]:.2f}, p down to {left:.2g} c")
     print(f"fast push over the undrained limit at its depth, {embedded(depth):.2f} c: {out['fast_over_embedded']:+.1%}")
     print("theory at the surface: " + ", ".join(f"{name} {value:.2f} c" for name, value in SURFACE.items()))
     return out
@@ -443,7 +446,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
         limit.plot(np.array(each.settlement) / each.settlement[-1], each.load, label=label, **style)
     limit.axhline(1, color="black", lw=0.8, ls=":")
     limit.set(xlabel="settlement / that at the end (-)", ylabel="load / theory (-)", xlim=(0, 1), ylim=(0, 1.15))
-    limit.set_title("Very stiff soil beside the theory")
+    limit.set_title("Very stiff soil: load / theoretical limit load")
     limit.legend(fontsize=8, loc="lower right")
     limit.grid(alpha=0.3)
     common.save(fig, out / "footing.png", dpi=90)

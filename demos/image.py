@@ -7,9 +7,10 @@ depend on the grey value there.  White tissue is ten times as stiff as black tis
 permeable plate compresses the tissue between smooth walls by an eighth of its height.  No water flows into the holes.
 On one process.
 
-Checks: `modulus` is stress divided by strain of the drained tissue under a small load, compared with Taylor-Hood
-elements, one for each pixel; in holes their stiffness is reduced to a millionth.  `drained` is the final settlement of
-the saturated tissue, compared with dry tissue.  Both errors decrease with the size of the pixels.
+Errors: `modulus` is the error of the drained modulus (stress / strain under a small load).  The reference has one
+Taylor-Hood element per pixel; elements in holes have a millionth of the stiffness of black tissue.  `drained` is the
+difference of the final settlement of the saturated tissue from that of dry tissue.  Both errors decrease with the size
+of the pixels.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def modulus(tissue: Tissue) -> tuple[float, float, float]:
 def run(tissue: Tissue, rtol: float) -> Outcome:
     """Compress the tissue and let it drain, in adaptive steps; then compress the dry tissue."""
     out, (simulation, top) = Outcome(), tissue.scene(LOAD, wet=True)
-    slow = EDGE**2 * mpm.Fluid().unit_weight / (CONDUCTIVITY * BULK)  # s: of the order of consolidation
+    slow = EDGE**2 * mpm.Fluid().unit_weight / (CONDUCTIVITY * BULK)  # s: of the order of the consolidation time
     times = np.append(RAMP * np.linspace(0.25, 1, 4), RAMP + slow * np.logspace(-3, 0.5, 15))
 
     def observe(s: mpm.Simulation) -> None:
@@ -141,7 +142,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--pixels", type=int, default=48, help="pixels along the edge of the image")
-    parser.add_argument("--seed", type=int, default=9, help="of the picture")
+    parser.add_argument("--seed", type=int, default=9, help="seed of the random image")
     parser.add_argument("--rtol", type=float, default=1e-2, help="relative error of the adaptive steps")
     o = parser.parse_args(argv)
     if not 8 <= o.pixels <= 200:

@@ -29,14 +29,14 @@ E, NU = 1e6, 0.2
 GEL = mpm.Hencky(bulk=E / (3 - 6 * NU), shear=E / (2 + 2 * NU), porosity=0.6, conductivity=1e-8)
 DEPTH = 0.03  # m
 UNDRAINED, DRAINED = 4 * GEL.shear, E / (1 - NU**2)  # Pa: E*
-TIME = SIZE**2 * mpm.Fluid().unit_weight / (GEL.conductivity * GEL.oedometric)  # s: of consolidation
-INSTANT = 1e-8  # of it
-TIMES = np.geomspace(1e-4, 10, 21)  # times divided by this time, at which the force is recorded
+TIME = SIZE**2 * mpm.Fluid().unit_weight / (GEL.conductivity * GEL.oedometric)  # s: time of consolidation
+INSTANT = 1e-8  # duration of the first step, divided by TIME
+TIMES = np.geomspace(1e-4, 10, 21)  # times at which the force is recorded, divided by TIME
 
 
 @dataclass
 class Contact:
-    """Contact at one time: force, N/m, and positions (m,), m, and pressures (m,), Pa, of points at the gel's surface.
+    """Contact at one time: force, N/m, and positions (k,), m, and pressures (k,), Pa, of points at the gel's surface.
 
     most, half: largest pressure, Pa, and half-width, m, of the ellipse fitted to these pressures.
     """
@@ -101,7 +101,7 @@ class Pressed:
 
 
 def pressed(cells: int, wet: bool) -> Pressed:
-    """Press the cylinder into the gel; let a saturated gel drain."""
+    """Press the cylinder into the gel; if the gel is saturated (`wet`), let it drain."""
     s = scene(cells, wet)
     tool = s.conditions[0]
     result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
@@ -131,11 +131,12 @@ def main(argv: list[str] | None = None) -> dict:
         errors |= dict(zip(["half, drained", "pressure, drained"], end.errors(DRAINED), strict=True))
         errors["force in the end, beside a dry gel"] = force[-1] / end.force - 1
         errors["force at any time, beside half as many cells"] = np.abs(rough - force).max() / force[0]
-        common.table([["what", "error"], *([name, f"{error:+.2%}"] for name, error in errors.items())])
+        common.table([["quantity", "error"], *([name, f"{error:+.2%}"] for name, error in errors.items())])
         out |= {"errors": errors, "balance": wet.balance, "force": wet.forces, "cuts": wet.cuts}
-        print(f"force at once {force[0]:.0f} N/m, drained {force[-1]:.0f} N/m, fluid balance {out['balance']:.0e}")
+        print(f"force: initial {force[0]:.0f}, drained {force[-1]:.0f} N/m; fluid balance {out['balance']:.0e}")
         draw(o, wet, (at_once, end))
-        worst = max(abs(error) for name, error in errors.items() if not name.startswith("half"))  # rough with few cells
+        # with few cells the half-width is too coarse for a check
+        worst = max(abs(error) for name, error in errors.items() if not name.startswith("half"))
         out["converged"] = bool(worst < 0.03 and out["balance"] < 1e-8)
     return out
 

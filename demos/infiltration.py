@@ -8,8 +8,8 @@ compared with a converged solution of Richards' equation, and with finite elemen
 same steps.
 
 Errors for the rain, at 1, 6 and 12 h: the largest error of the head, divided by the largest head.  Errors for the
-front, at 6 and 12 h, of material points and of finite elements: the depth at which the head is -5 m, and the
-infiltrated water.  On one process.
+front, at 6 and 12 h: of the depth at which the head is -5 m, and of the infiltrated water; both with material points
+and with finite elements.  On one process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}
-"""By hour: depth of the head of -5 m, and infiltrated water, m, of 1600 finite volumes, extrapolated."""
+"""By hour: depth at which the head is -5 m, and infiltrated water, m; by 1600 finite volumes, extrapolated."""
 DRY = {
     "soil": mpm.LinearElastic(
         **STIFF,

@@ -8,7 +8,7 @@ settles under its weight without inertia, and its factor of safety is 1.4.  Then
 With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it.  Without
 inertia, as in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then
 stops at the first stable shape, so its run-out is shorter.  Energies balance: friction dissipates the work of gravity,
-except for the elastic part.
+except for the part that is stored elastically.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--dt", type=float, default=0.05, help="step of the slide, s")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or not 0.01 <= o.dt <= 0.2:
-        parser.error(f"--cells {o.cells} --dt {o.dt:g}: must be even and >= 2, in [0.01, 0.2]")
+        parser.error(f"--cells {o.cells}: must be even and >= 2; --dt {o.dt:g}: must be in [0.01, 0.2]")
     with common.results(o) as out:
         s, other = slope(o.cells), still.slope(o.cells)
         before = s.points.corners.copy()
@@ -81,8 +81,8 @@ def main(argv: list[str] | None = None) -> dict:
         out |= {"moved": float(moved.max()), "without": float(crept.max()), "speed": float(speed.max())}
         out |= {"energy": float(np.abs(total - total[0]).max() / e["external"][-1]), "last_speed": float(speed[-1])}
         with_inertia = f"{out['moved']:.2f} m at up to {out['speed']:.2f} m/s"
-        print(f"with inertia it moves by {with_inertia}, without by {out['without']:.2f} m")
-        print(f"energies are off by {out['energy']:.2%} of the work of the weight")
+        print(f"largest displacement: with inertia {with_inertia}, without {out['without']:.2f} m")
+        print(f"error of the energy balance: {out['energy']:.2%} of the work of the weight")
         bounds = out["energy"] <= BALANCE and out["last_speed"] < REST and out["moved"] > out["without"]
         out["converged"] = bounds or (o.cells, o.dt) != (10, 0.05)
         draw(o, result, speed, s.points.corners, moved, before)

@@ -40,7 +40,7 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 
 @dataclass
 class Outcome:
-    """Results of a run, with an entry for each step: T, x, m, and p, Pa, of the cells (columns, rows), settlements, m.
+    """Results of a run, with an entry for each step: T; x, m, and p, Pa, of the cells (columns, rows); settlements, m.
 
     Settlements are those of the top, at eleven positions from the middle to the side.
     """
@@ -119,8 +119,8 @@ def main(argv: list[str] | None = None) -> dict:
         found, outcome = run(o.cells, o.steps)
         out |= {"errors": found, "wall_s": sum(stage.wall for stage in outcome.stages)}
         print(f"{o.cells} cells, {4 * o.steps} steps, {out['wall_s']:.1f} s")
-        of = {name: "force / a" if name[2:3].isdigit() else "itself" for name in found}
-        common.table([["error", "", "of"], *([name, f"{error:.3%}", of[name]] for name, error in found.items())])
+        of = {name: "force / a" if name[2:3].isdigit() else "exact value" for name in found}
+        common.table([["error", "", "scale"], *([name, f"{error:.3%}", of[name]] for name, error in found.items())])
         draw(o, outcome)
     return out
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is undrained, and follows von Mises's law, with strength s_u in plane strain.  The bar starts inside the clay
+The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  The bar starts inside the clay
 and is pushed until the clay flows all around it.  Then the resistance of the bar is that of Randolph and Houlsby (1984)
 for an adhesion alpha s_u on its surface,
 
@@ -12,19 +12,19 @@ keeps the gap behind the bar closed.  The clay settles under this pressure, and 
 In a narrower block the resistance is lower.  With four diameters, N of a rough bar is 10.9 and 10.8 with 8 and 16 cells
 over the diameter.
 
-Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  The clay is therefore
-seeded again around the bar after each quarter of a diameter, with the present stresses (remeshing and interpolation: Hu
+Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  After each quarter of
+a diameter, new points are therefore seeded around the bar, with the present stresses (remeshing and interpolation: Hu
 and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each new
 seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter.  `spread`
-is the variation of N in these parts.
+is the range of N in these parts, divided by the mean.
 
 Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
 c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
-once.  Its domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as
-the others.
+once.  Domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as the
+other domains.
 
 With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
-larger cells widen behind the bar and narrow ahead of it.  The number of cells does not change.
+larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ ROUGH = (0.0, 0.5, 1.0)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 LEG, STEADY = 0.25, 0.75  # diameters between seedings; fraction of this distance after which N is used
 BEARS = 0.999  # largest stress after a new seeding, as a fraction of the strength
-STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar moves in a step
-NOSE = 0.02  # width of the narrowest domains of saturated clay, divided by that of the others
-PARTS = 4  # each of those that widen away from the nose is a part of its distance from there
+STEP, WET_STEP = 1 / 24, 1 / 18  # motion of the bar in a step, in cell sizes: dry and wet clay
+NOSE = 0.02  # width of the narrowest domains of saturated clay, divided by the width of the widest
+PARTS = 4  # the narrowest domains at the nose; each wider one has 1 / PARTS of its outer end's distance from the nose
 CLAY = mpm.DruckerPrager(2 * SHEAR, SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH, conductivity=1e-9)
 WATER = mpm.Fluid()
 CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-2}  # V
-SETTLED = 1e-3  # fraction of the time of the run in which the pressure is applied
-BALANCE = 1e-8  # relative error of the fluid balance that is allowed
+SETTLED = 1e-3  # time in which the pressure is applied, divided by the time of the push
+BALANCE = 1e-8  # allowed relative error of the fluid balance
 FINE_ZONE, RATIO = 1.0, 1.3  # m: region of small cells around the bar; ratio of cell sizes outside this region
 
 
@@ -67,7 +67,11 @@ def exact(alpha: float) -> float:
 
 
 def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between domains around the bar; ahead of it, at angle 0, widths are `nose` times the others."""
+    """Return the angles between which the domains around the bar lie; angle 0 is ahead of the bar.
+
+    around: number of domains of equal width.  nose: width of the narrowest domains, ahead of the bar, divided by this
+    width; 1: all domains have this width.
+    """
     even = np.linspace(0, np.pi, around + 1)
     if nose == 1:
         return even
@@ -105,9 +109,11 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
 
 @dataclass
 class Push:
-    """Results by step: depths / D, resistances / (s_u D), whether errors include them, and excess pressures / s_u.
+    """Results of each step: depth / D; N, resistance / (s_u D); excess pressure / s_u.
 
-    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (m, 4, 2), m.  The field is the
+    steady: whether this step counts in the error of N.
+
+    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (k, 4, 2), m.  The field is the
     displacement of the points since the clay was seeded, divided by that of the bar; in wet clay the excess pressure
     divided by s_u.  lines: final grid lines along both axes, m.
     """
@@ -135,7 +141,10 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar from y D by `way` D, with initial stresses `stress`, or after loading; return the final stresses."""
+    """Push a bar down by `way` D from the height y D, append the results to `out`, and return the final stresses.
+
+    stress: initial stresses, see `kept`; None: the clay is first loaded by the pressure on its top.
+    """
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
@@ -161,7 +170,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return a function of positions x (n, 2), m: interpolated effective stress (n, 3, 3), Pa, within the strength."""
+    """Return a function of positions x (n, 2), m: interpolated effective stress (n, 3, 3), Pa, at most the strength."""
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
     between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
@@ -212,16 +221,17 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
-    parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
-    parser.add_argument("--depth", type=float, default=1.0, help="of the pushes, over the diameter")
+    parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="roughnesses alpha of the bar")
+    parser.add_argument("--depth", type=float, default=1.0, help="depth of each push / diameter")
     parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in saturated clay")
-    parser.add_argument("--wet-depth", type=float, default=1.0, help="of the pushes into wet clay, over the diameter")
+    parser.add_argument("--wet-depth", type=float, default=1.0, help="depth of each push in wet clay / diameter")
     parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
-        parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 4], in [0, 1]")
+        cells, depth = f"--cells {o.cells}: must be 4 to 32", f"--depth {o.depth}: must be in (0, 4]"
+        parser.error(f"{cells}; {depth}; --rough {o.rough}: must be in [0, 1]")
     if not 4 <= o.wet_cells <= 32 or not 0 < o.wet_depth <= 1:
-        parser.error(f"--wet-cells {o.wet_cells} --wet-depth {o.wet_depth}: must be 4 to 32, in (0, 1]")
+        parser.error(f"--wet-cells {o.wet_cells}: must be 4 to 32; --wet-depth {o.wet_depth}: must be in (0, 1]")
     runs = {}
     with common.results(o) as out:
         out |= {"errors": {}, "cuts": 0, "steps": 0}

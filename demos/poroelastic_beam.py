@@ -60,7 +60,7 @@ def arguments(argv: list[str] | None = None) -> Namespace:
         help="exact integration of domains, or point quadrature as in standard MPM",
     )
     add("--offset", type=float, default=0.5, help="distance of the beam's underside from a grid line, cells")
-    add("--box-scale", type=int, default=1, help="size of the background grid, in boxes of 1.5 m x 1.2 m")
+    add("--box-scale", type=int, default=1, help="length and height of the background grid, divided by 1.5 m and 1.2 m")
     add("--coupling", choices=tuple(mpm.COUPLINGS), default="schur-cg", help="coupling scheme")
     add("--drained", action="store_true", help="no fluid at all")
     add("--reference", action="store_true", help="also compute the Taylor-Hood solution")

@@ -3,7 +3,7 @@
 
 A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  A column
 stands on a water table 5 m below the surface, under the component of gravity normal to the slope.  The column starts at
-rest.  Then vertical rain, nine tenths of the conductivity, falls until the flow is steady.  At a vertical depth d the
+rest.  Then vertical rain of nine tenths of the conductivity falls until the flow is steady.  At a vertical depth d the
 factor of safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
@@ -16,10 +16,10 @@ Source: Lu and Godt (2008) for vertical flow; here the component of gravity norm
 Errors: the largest error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
 
 With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and a
-cohesion that vanishes with slip stabilise the bank.  The suction decreases until equilibrium is impossible.  With
-inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.  Checks:
-balances of energy and water.  With 6 and 10 cells over its height, the bank fails after 1.7 and 1.5 h, and runs out by
-3.2 and 2.7 m.  On one process.
+cohesion that falls to a tenth with slip stabilise the bank.  The suction decreases until equilibrium is impossible.
+With inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.
+Checks: balances of energy and water.  With 6 cells over its height, the bank fails after 1.7 h and runs out by 3.2 m;
+with 10 cells, after 1.5 h and by 2.7 m.  On one process.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ DEPTHS = np.array([1.0, 2.0, 3.0, 5.0])  # m
 DAY = 86400.0  # s
 TIMES = (0.25, 0.5, 1.0, 2.0, 20.0)  # days
 BANK, BANK_ANGLE, CREST, RANGE = 5.0, np.radians(60.0), 3.0, 11.0  # m, -, m, m
-RAIN, LONGEST = 6e-5, 60e3  # m/s; s, in which the bank fails
-SLIDES, MOVES, REST = 5.0, 0.2, 0.05  # s; m: smallest displacement of a slide; m/s: largest speed at rest
-LEAKS = 2e-8  # of the water in the bank
+RAIN, LONGEST = 6e-5, 60e3  # m/s; longest time until failure, s
+SLIDES, MOVES, REST = 5.0, 0.2, 0.05  # duration of the slide, s; smallest displacement in it, m; speed at rest, m/s
+LEAKS = 2e-8  # allowed error of the water balance, relative to the water in the bank
 BALANCE = 0.01  # allowed error of the energy balance, relative to the work of the weight
 
 
@@ -235,7 +235,7 @@ def main(argv: list[str] | None = None) -> dict:
     if o.cells < 5:
         parser.error(f"--cells {o.cells}: must be >= 5")
     if o.slope < 0 or o.slope % 2 or not 0.005 <= o.slide_step <= 0.2:
-        parser.error(f"--slope {o.slope} --slide-step {o.slide_step:g}: must be 0, 2, 4, ..., in [0.005, 0.2]")
+        parser.error(f"--slope {o.slope}: must be 0, 2, 4, ...; --slide-step {o.slide_step:g}: must be in [0.005, 0.2]")
     with common.results(o) as out:
         s = column(o.cells)
         curves = [(0.0, *found(s))]
@@ -253,9 +253,9 @@ def main(argv: list[str] | None = None) -> dict:
             out |= (of := slide(o))
             print(
                 f"the bank fails after {of['failed'] / 3600:.2f} h, slides at up to {of['speed']:.1f} m/s, and runs "
-                f"out by {of['run_out']:.1f} m; some of it moves by {of['moved']:.1f} m"
+                f"out by {of['run_out']:.1f} m; the largest displacement is {of['moved']:.1f} m"
             )
-            print(f"balances: energies {of['energy']:.2%} of the work of the weight, water {of['water']:.1e}")
+            print(f"errors: energy balance {of['energy']:.2%} of the weight's work, water balance {of['water']:.1e}")
             within = of["energy"] <= BALANCE and of["last_speed"] < REST and of["water"] < LEAKS
             out["converged"] = bool(out["converged"] and (within or (o.slope, o.slide_step) != (10, 0.02)))
     return out

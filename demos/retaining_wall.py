@@ -12,9 +12,9 @@ the wall, and Rankine's zone (Prandtl, Sokolovskii).  Without friction, delta = 
 / (1 ∓ sin(phi)).  Coulomb's solution is the critical wedge with a plane slip surface.
 
 The moment about the toe, which is work-conjugate to the rotation, also gives K.  A tilting wall opens no gap at its
-toe.  A translating wall opens a gap and carries nothing there: without the last of ten cells, the active thrust is a
-tenth too small.  The sand is stiff, so that it flows at a small tilt.  At two and a half times this tilt, the active
-thrust is 2.5 to 3 % larger.
+toe.  A translating wall opens a gap at its toe, and no force acts there: without the lowest of ten cells, the active
+thrust is a tenth too small.  The sand is stiff, so that it flows at a small tilt.  At two and a half times this tilt,
+the active thrust is 2.5 to 3 % larger.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=WAYS)
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 40 or any(not 0 <= delta <= 20 for delta in o.delta):
-        parser.error(f"--cells {o.cells} --delta {o.delta}: must be 4 to 40, 0 to 20 degrees")
+        parser.error(f"--cells {o.cells}: must be 4 to 40; --delta {o.delta}: must be 0 to 20 degrees")
     with common.results(o) as out:
         out |= {"errors": {}, "moments": {}, "cuts": 0, "steps": 0}
         rows, runs = [["wall", "exact", "Coulomb", "thrust", "moment"]], {}

@@ -3,9 +3,9 @@
 
 A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  The computed ground ends at an absorbing base, 5 m
 below the layer.  A shear pulse enters through this base, and reflections from layer and surface leave through it.  The
-sides have no vertical displacement, as in an infinite layer. The reference motion is that of a free surface of the
-ground without the layer, which is twice the incoming wave.  The spectrum of the surface motion, divided by that of the
-reference motion, is
+sides have no vertical displacement, as in an infinite layer. The reference is the motion of a free surface of the
+ground without the layer; this motion is twice the incoming wave.  The spectrum of the surface motion, divided by that
+of the reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
@@ -23,7 +23,7 @@ import numpy as np
 import mpm_dolfinx as mpm
 
 LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground in the scene
-SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # of ground and layer: m/s, kg/m³, -
+SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # ground, layer: m/s, kg/m³; both: -
 PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: frequency and middle of Ricker's wavelet, duration of the run
 BAND = (0.5, 6.5)  # Hz: range in which spectra are compared
 BOUNDS = {"amplification": 0.03, "energy": 0.01}
@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=500, help="steps of the run")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 50:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, >= 50")
+        parser.error(f"--cells {o.cells}: must be even and >= 4; --steps {o.steps}: must be >= 50")
     with common.results(o) as out:
         result, surface = shaken(o.cells, o.steps)
         came = incoming(result.t)
@@ -89,8 +89,8 @@ def main(argv: list[str] | None = None) -> dict:
         out["energy"] = float(np.abs(total - total[0]).max() / e["external"][-1])
         out["left"] = float((e["kinetic"] + e["elastic"])[-1] / e["external"][-1])
         rows = [["amplification, largest error", f"{out['amplification']:.2%}"]]
-        rows += [["energies out of balance, of the work of the wave", f"{out['energy']:.2%}"]]
-        common.table([["", ""], *rows, ["energy that is left, of that work", f"{out['left']:.1e}"]])
+        rows += [["error of the energy balance / work of the wave", f"{out['energy']:.2%}"]]
+        common.table([["", ""], *rows, ["remaining energy / work of the wave", f"{out['left']:.1e}"]])
         usual = (o.cells, o.steps) == (20, 500)
         out["converged"] = not usual or all(out[name] <= most for name, most in BOUNDS.items())
         draw(o, result, surface, f[band], found[band])

@@ -5,8 +5,8 @@ A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20
 dilation.
 
 1. Factor of safety: the largest divisor of c and tan(phi) for which the slope is stable.  `mpm.factor_of_safety`
-   reduces the strength of the slope at rest, and checks whether the viscous stress, in excess of the strength, decays.
-   The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
+   reduces the strength of the slope at rest, and checks whether the overstress, a viscous stress, decays.  The best
+   log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
 2. Run-out: the strength is suddenly divided by 1.6, in soil with the viscosity eta.  The slope slides until its new
    shape is just stable.  The factor of safety of this shape differs from one by less than 0.1.
 """
@@ -77,8 +77,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--rtol", type=float, default=0.01, help="relative accuracy of the factor of safety")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or o.steps < 1 or not 1e-3 <= o.rtol <= 0.1:
-        options = f"--cells {o.cells} --steps {o.steps} --rtol {o.rtol:g}"
-        parser.error(f"{options}: must be even and >= 2, >= 1, and in [1e-3, 0.1]")
+        options = f"--cells {o.cells}: must be even and >= 2; --steps {o.steps}: must be >= 1"
+        parser.error(f"{options}; --rtol {o.rtol:g}: must be in [1e-3, 0.1]")
     with common.results(o) as out:
         s = slope(o.cells)
         before = s.points.corners.copy()
@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> dict:
         out["moved"] = float(moved.max())
         after = mpm.factor_of_safety(s, rtol=3 * o.rtol)
         out |= {"factor_after": after.factor, "converged": abs(after.factor - 1) < 0.1}
-        print(f"strength over {WEAKER}: moves by {moved.max():.2f} m; its factor of safety is then {after.factor:.3f}")
+        print(f"strength / {WEAKER}: moves by {moved.max():.2f} m; new factor of safety {after.factor:.3f}")
         draw(o.out, safety, before, corners, moved)
     return out
 

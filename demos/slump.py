@@ -8,9 +8,9 @@ is buoyant, gamma' = (1 - n) (rho_s - rho_w) g, and is a term in UFL.  Inertia i
 1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
    height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
    2000; critical slip circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
-   step as in the first steps; with 10 or 40 times, the result changes by 1 %.  With 10 and 20 cells over the height the
-   bank fails at gamma' H / c = 3.93 and 3.85, which is 3.9 and 1.9 % too large.  This error is of first order in the
-   cell size, and the extrapolated value is 3.78.
+   step as in the first steps; with 10 or 40 times, the result changes by 1 %.  With 10 cells over
+   the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large; with 20 cells at 3.85, 1.9 % too large.
+   This error is of first order in the cell size, and the extrapolated value is 3.78.
 2. Run-out.  The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
    more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The
@@ -51,7 +51,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank with a probe on its crest; cells: over its height; room: floor in front of it, m."""
+    """Return the consolidated bank with a probe on its crest; cells: over its height; room: floor in front, m."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -77,7 +77,7 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma H / c (n,), and settlements of the crest in each step / those in the first five (n,).
+    """Stability numbers gamma H / c (n,), and settlement of the crest in each step / its mean in the first five (n,).
 
     critical: the stability number at which the bank fails.
     """
@@ -111,7 +111,7 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 class Frame:
     """State of the bank at one time, s.
 
-    corners of the domains, m; surface: positions (m, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic
+    corners of the domains, m; surface: positions (k, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic
     strain; volume, m²; cohesion, Pa.
     """
 
@@ -245,7 +245,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--steps", type=int, default=100, help="number of steps in which the cohesion decreases")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, and >= 10")
+        parser.error(f"--cells {o.cells}: must be even and >= 4; --steps {o.steps}: must be >= 10")
     with common.results(o) as out:
         failures = []
         for cells in (o.cells // 2, o.cells):
@@ -273,11 +273,11 @@ def report(run: Slump, found: dict[str, float]) -> None:
         rows.append([name, f"{f.t:.3g}", f"{f.run_out:.2f}", f"{height:.2f}", f"{f.slope:.1f}°", p])
     common.table(rows)
     print(f"critical strength, extrapolated to h = 0: {found['critical_extrapolated']:+.1%} of gamma' H / c")
-    print(f"volume until at rest: {found['volume']:+.1e}; fluid balance {found['fluid_balance']:.1e}")
+    print(f"change of the volume until rest: {found['volume']:+.1e}; fluid balance {found['fluid_balance']:.1e}")
     steepest = run.frames[run.drained].steepest(HEIGHT / 3)
-    print(f"steepest slope in the end over {HEIGHT / 3:.1f} m: {steepest:.1f}°, friction {FRICTION:g}°")
-    print(f"pressures at the toe that alternate from cell to cell: {run.alternating / 1e3:.2f} kPa rms, at most")
-    print(f"run-out at rest: grows by {found['creep_at_rest']:.1e} in the last step")
+    print(f"steepest final slope over {HEIGHT / 3:.1f} m: {steepest:.1f}°, friction angle {FRICTION:g}°")
+    print(f"alternating part of the pressures at the toe: at most {run.alternating / 1e3:.2f} kPa rms")
+    print(f"relative growth of the run-out in the last step before rest: {found['creep_at_rest']:.1e}")
 
 
 def stages(run: Slump) -> dict[str, int]:
@@ -353,14 +353,14 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
         ax.plot(f.critical, RUNAWAY, "o", mfc="none", ms=9, color=line.get_color(), label=f"fails at {f.critical:.2f}")
     ax.axvline(THEORY, color="black", lw=1, ls="--", label=f"limit analysis: {THEORY}")
     ax.set(xlabel=r"$\gamma' H / c$ (-)", ylabel="settlement in a step / that at the start (-)")
-    ax.set_title("The strength is lowered by 1 % a step, undrained, without friction", fontsize=11)
+    ax.set_title("Undrained, without friction: the strength falls by 1 % in each step", fontsize=11)
     ax.grid(alpha=0.3)
     ax.legend()
     common.save(fig, path, dpi=110)
 
 
 def animate(path: Path, run: Slump) -> None:
-    """Draw the slump as an animation, in which time is faster in each later part."""
+    """Draw the slump as an animation; each later part runs faster."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     weak = int(np.argmax([f.cohesion <= 1.001 * WEAK for f in run.frames]))

@@ -3,9 +3,10 @@
 
 Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1
 to 1e-5 of the time of consolidation.  The error is the root mean square of (p - exact) / p0 at the centroids of all
-cells.  The error of time integration decreases with the step.  The remaining error must be the spatial error, which is
-known from the exact solution in time of the semi-discrete equations.  This spatial error must not depend on the number
-of steps; if pressures were averaged to points and back in every step, they would diffuse.  Three columns:
+cells.  The error of time integration decreases with the step.  The remaining error must be the spatial error.  It is
+known, because the semi-discrete equations have an exact solution in time.  The remaining error must not depend on the
+number of steps.  If pressures were averaged to points and back in every step, they would diffuse.  Three columns are
+computed:
 
 * column at rest on the grid;
 * moving column: during consolidation the base moves down by half the height, through half of all cells;
@@ -40,8 +41,8 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""Base displacement divided by the column height; storage coefficient of the water times the oedometric modulus M."""
-STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # fraction of the layer's time of consolidation
+"""For each column: base displacement / height; storage coefficient of the water times the oedometric modulus M."""
+STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step / time of consolidation of the layer
 
 
 @dataclass
@@ -119,7 +120,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=25, help="cells over the height of the column")
-    parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="to T_v = 0.1")
+    parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="numbers of steps")
     parser.add_argument("--strip-cells", type=int, default=20, help="cells over the height of the layer")
     o = parser.parse_args(argv)
     for name in ("cells", "steps", "strip_cells"):

@@ -12,9 +12,9 @@ time.
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
 cells. The extrapolated settlements differ from those of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  Errors:
 `settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once` its error at
-T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` that at the far corner.  All
-errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on the same cells. On
-one process.
+T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` is the error at the far corner.
+All errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on the same
+cells. On one process.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def conditions(load: float) -> dict:
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the times T at which steps end: `a_decade` in each decade after RAMP, and two thirds of them before."""
+    """Return the times T at which steps end: `a_decade` in each decade after RAMP, two thirds of this number before."""
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
 
@@ -139,7 +139,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--reference", action="store_true", help="also run Taylor-Hood elements on the same cells")
     o = parser.parse_args(argv)
     if o.cells < 5 or not 0 < o.load <= 1 or o.steps < 4 or o.steps % 2:
-        parser.error(f"--cells {o.cells} --load {o.load} --steps {o.steps}: must be >= 5, in (0, 1], even and >= 4")
+        cells, load = f"--cells {o.cells}: must be >= 5", f"--load {o.load}: must be in (0, 1]"
+        parser.error(f"{cells}; {load}; --steps {o.steps}: must be even and >= 4")
     with common.results(o) as out:
         outcome = run(o.cells, o.load, o.steps)
         found = errors(outcome) if o.load == 0.25 and not outcome.why else {}

@@ -97,7 +97,7 @@ def take(run: str, table: str, pictures: bool) -> None:
         kept(run).write_text(json.dumps(printed, indent=1) + "\n")
         if table:
             kept(run).with_suffix(".md").write_text((Path(folder) / table).read_text())
-        for picture in (DEMOS / "pictures").iterdir():  # those of the pages
+        for picture in (DEMOS / "pictures").iterdir():  # pictures on the pages
             if pictures and (Path(folder) / picture.name).exists():
                 shutil.copy(Path(folder) / picture.name, picture)
 

@@ -99,13 +99,15 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--method", choices=tuple(METHODS), default="sdirk2", help="time integration")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10:
-        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1 and >= 10")
+        parser.error(f"--cells {o.cells}: must be >= 1; --steps {o.steps}: must be >= 10")
     with common.results(o) as out:
         outcome = run(o.cells, o.steps, method=o.method, rtol=o.rtol)
         out |= {"errors": errors(outcome), "steps": outcome.result.steps, "wall_s": outcome.result.wall}
         print(f"{o.cells} cells, {out['steps']} steps, {out['wall_s']:.1f} s")
-        scales = {"p_0.1": "p0", "p_0.5": "p0", "p_1": "p0", "settlement": "itself at T_v = 0.5"}
-        common.table([["error", "", "of"], *([name, f"{out['errors'][name]:.4%}", of] for name, of in scales.items())])
+        scales = {"p_0.1": "p0", "p_0.5": "p0", "p_1": "p0", "settlement": "exact value"}
+        common.table(
+            [["error", "", "scale"], *([name, f"{out['errors'][name]:.4%}", of] for name, of in scales.items())]
+        )
         draw(o, outcome)
     return out
 

@@ -2,10 +2,10 @@
 """Triaxial tests of soil laws at a point, compared with closed-form solutions, to check a law before its use.
 
 Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the same isotropic stress.
-In an undrained test the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs. During
-yield Q = M sqrt(P (P_c - P)).  In a drained test the stress path is q = 3 (p - p_0), and ends at q = M p.  Tests of
-Mohr-Coulomb sand, in compression and in extension, end at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi in
-Kirchhoff stresses.
+P, Q and t_i are Kirchhoff stresses, p and q Cauchy stresses.  In an undrained test the volume is constant, so the test
+ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  During yield Q = M sqrt(P (P_c - P)).  In a drained test the
+stress path is q = 3 (p - p_0), and ends at q = M p.  Tests of Mohr-Coulomb sand, in compression and in extension, end
+at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi, with the principal stresses t_1 and t_3.
 
 Errors are relative, and refer to the final states.
 
@@ -81,10 +81,11 @@ def costs(cells: int, steps: int = 30) -> dict[str, float]:
             begun = time.process_time()
             newton[name] += s.run(float(k), 1.0, progress=False).newton
             spent[name].append(time.process_time() - begun)
-    medians = {name: float(np.median(seconds[2:])) for name, seconds in spent.items()}  # the first ones compile
+    medians = {name: float(np.median(seconds[2:])) for name, seconds in spent.items()}  # the first two compile
     for name, seconds in medians.items():
         ratio = seconds / medians["Drucker-Prager"]
-        print(f"{name:16} {seconds:.3f} s a step, {ratio:.2f} times, {newton[name] / steps:.1f} Newton steps a step")
+        times = f"{seconds:.3f} s per time step, {ratio:.2f} times that of Drucker-Prager"
+        print(f"{name:16} {times}, {newton[name] / steps:.1f} Newton steps per time step")
     return {name: seconds / medians["Drucker-Prager"] for name, seconds in medians.items()}
 
 
@@ -133,7 +134,7 @@ def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict
     sand.set(xlabel="axial strain (-)", ylabel="q / p0, 10 x volume growth (-)", title="Mohr-Coulomb sand, drained")
     for ax in (path, curve, water, sand):
         ax.grid(alpha=0.3)
-    path.legend(fontsize=8)  # of all three panels
+    path.legend(fontsize=8)  # the legend for all three panels
     sand.legend(fontsize=8, loc=(0.45, 0.45))
     common.save(fig, out / "triaxial.png", dpi=90)
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Two gels are pressed together, slide along each other with friction, and separate.
 
-Two half-discs are groups of bodies, each with its own displacements.  The lower gel is fixed, and the upper gel follows
-a prescribed path.  While the gels are apart no force acts between them, however narrow the gap.  As the upper gel
-passes over the top of the lower one, the contact surface inclines.  The ratio of horizontal to vertical force is then
-less than the friction coefficient.
+Each of two half-discs is a group of bodies with its own displacements.  The lower gel is fixed, and the upper gel
+follows a prescribed path.  While the gels are apart no force acts between them, however narrow the gap.  As the upper
+gel passes over the top of the lower one, the contact surface inclines.  The ratio of horizontal to vertical force is
+then less than the friction coefficient.
 
 A second scene is the contact of a curved and a flat elastic body.  Largest pressure and half-width are compared with
 Hertz's solution for the computed force.  Both errors are due to the small number of cells over the half-width.
@@ -105,7 +105,7 @@ def main(argv: list[str] | None = None) -> dict:
         ratio = float(np.abs(force[slides, 0]).sum() / force[slides, 1].sum())
         out |= {"steps": result.steps, "ratio": ratio}
         out |= {"largest": float(force[:, 1].max()), "parted": float(np.abs(force[-1]).max()), "hertz": hertz(o.hertz)}
-        print(f"largest force {out['largest']:.4g} N/m; parted {out['parted']:.3g}")
+        print(f"largest force {out['largest']:.4g} N/m; force after separation {out['parted']:.3g} N/m")
         print("Hertz, {cells:.1f} cells: pressure {pressure:+.1%}, half-width {half_width:+.1%}".format(**out["hertz"]))
         draw(o.out, shown, t, force)
         out["converged"] = bool(result.converged and out["parted"] == 0)

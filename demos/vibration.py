@@ -2,9 +2,9 @@
 """Vibration of a beam and of a bar: frequencies and energy loss against exact values.
 
 1. A clamped beam, 1 x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
-   theory is accurate.  The reference of the first bending frequency is 3.24419 Hz, by spectral elements graded to the
-   clamp's corners. The first axial frequency is exactly c / (4 L) = 17.67767 Hz.  The computed frequencies are fitted
-   to the motion of the tip over three periods.
+   theory is accurate.  The reference of the first bending frequency is 3.24419 Hz, by spectral elements that are graded
+   towards the corners of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767 Hz.  The computed
+   frequencies are fitted to the motion of the tip over three periods.
 2. A free bar, P = E (F - 1), vibrates with strains of 5 % and moves over fifty cells in 25 periods.  In the exact
    solution the ends oscillate about the uniform motion by A / (pi c) sin(pi c t / L), without loss of energy.  In each
    step SDIRK2 itself loses the fraction gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy, with y = omega dt.  The
@@ -93,12 +93,12 @@ def main(argv: list[str] | None = None) -> dict:
         "--h", type=float, nargs="+", default=[0.1, 0.05], help="cell sizes of the beam, m; 0.3 / h must be an integer"
     )
     parser.add_argument("--cells", type=int, default=20, help="cells over the bar")
-    parser.add_argument("--periods", type=int, default=25, help="that the bar flies")
+    parser.add_argument("--periods", type=int, default=25, help="periods of the moving bar")
     parser.add_argument("--steps", type=int, default=40, help="steps in a period of the bar")
     o = parser.parse_args(argv)
     if min(o.cells, o.periods) < 1 or o.steps < 8 or any(abs(DEPTH / h % 1 - 0.5) < 0.49 or h > 0.1 for h in o.h):
-        options = f"--h {o.h} --cells {o.cells} --periods {o.periods} --steps {o.steps}"
-        parser.error(f"{options}: must be parts of 0.3 m up to 0.1, >= 1, >= 1 and >= 8")
+        options = f"--h {o.h}: 0.3 m / h must be an integer, h <= 0.1 m; --cells {o.cells}, --periods {o.periods}"
+        parser.error(f"{options}: must be >= 1; --steps {o.steps}: must be >= 8")
     with common.results(o) as out:
         beams = {(way, h): struck(h, way) for h in o.h for way in EXACT}
         out["frequency_errors"] = {way: [beams[way, h][2] / EXACT[way] - 1 for h in o.h] for way in EXACT}

@@ -10,9 +10,9 @@ The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  Th
 days, is constant for two days, and falls again in two days.  The soil of the levee retains water under suction, so
 water that infiltrates late also drains late.
 
-Errors: the largest error of the height of the water table, m, at six positions after 2, 3, 4 and 8 hours, and the
-relative error of the final outflow into the ditch.  `balance` is the error of the slab's water balance, divided by the
-volume of rain.  On one process.
+Errors after 2, 3, 4 and 8 hours: the largest error of the height of the water table at six positions, m.  A further
+error is the relative error of the final outflow into the ditch.  `balance` is the error of the slab's water balance,
+divided by the volume of rain.  On one process.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def main(argv: list[str] | None = None) -> dict:
         gained = s.cells().water.sum() - start
         balance = float(abs(gained + s.outcome("flowed")["ditch"] - fell) / fell)
         common.table([["hours", "table, m"], *([f"{h:g}", f"{e:.4f}"] for h, e in zip(CONVERGED, errors, strict=True))])
-        print(f"flow into the ditch {flow:+.2%}, water {balance:.1e}")
+        print(f"errors: flow into the ditch {flow:+.2%}, water balance {balance:.1e}")
         bank = levee(2.5 * o.h)
         frames = []
         for days in SEEN:

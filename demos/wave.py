@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load acts on a dry column, 10 m high, whose base is rigid and reflects the wave, or absorbs it.  The stress
-   on the base is zero until L / c.  Then it is 2 q on a rigid base, until 3 L / c, and q on an absorbing base.  Behind
-   the front the velocity of the soil is q / (rho c).  Stresses oscillate behind a front, so their means are compared.
+1. A sudden load q acts on a dry column of height L = 10 m.  Its base is rigid and reflects the wave, or absorbs the
+   wave.  With the wave velocity c and the density rho, the stress on the base is zero until L / c.  Then it is 2 q on a
+   rigid base, until 3 L / c, and q on an absorbing base.  Behind the front the velocity of the soil is q / (rho c).
+   Stresses oscillate behind a front, so their means are compared.
 2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), is slow or
    fast.  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
    case, water drains only from a layer of 0.3 m below the top, little more than a cell, so the settlement is not
@@ -129,10 +130,10 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height of the columns")
     parser.add_argument("--steps", type=int, default=50, help="steps in a period of the harmonic load")
-    parser.add_argument("--periods", type=int, default=6, help="that it swings")
+    parser.add_argument("--periods", type=int, default=6, help="periods of the harmonic load")
     o = parser.parse_args(argv)
     if min(o.cells, o.steps) < 8 or o.periods < 2:
-        parser.error(f"--cells {o.cells} --steps {o.steps} --periods {o.periods}: must be >= 8, >= 8 and >= 2")
+        parser.error(f"--cells {o.cells}, --steps {o.steps}: must be >= 8; --periods {o.periods}: must be >= 2")
     with common.results(o) as out:
         dry = {base: sudden(o.cells, base) for base in ("rigid", "quiet")}
         found = {base: run["stress"][(run["t"] > 1.3) & (run["t"] < 2.7)] for base, run in dry.items()}
@@ -157,7 +158,7 @@ def main(argv: list[str] | None = None) -> dict:
         judged = {**out["harmonic"], "slow": {"p": out["harmonic"]["slow"]["p"]}}
         every = {"sudden": out["sudden"], **out["harmonic"], "hard": out["hard"]}
         rows = [[case, key, f"{off:.2%}"] for case, errors in every.items() for key, off in errors.items()]
-        common.table([["load", "of", "error"], *rows])
+        common.table([["load", "quantity", "error"], *rows])
         usual = (o.cells, o.steps, o.periods) == (40, 50, 6)
         out["converged"] = not usual or all(
             off <= BOUNDS[key] for e in (out["sudden"], *judged.values(), out["hard"]) for key, off in e.items()

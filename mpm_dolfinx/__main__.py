@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants of a law from texts name=value; each name must be one of the law's, and given once."""
+    """Return the constants of a law from texts name=value.  Each name must be a constant of the law, and occur once."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")
@@ -114,8 +114,8 @@ def main(argv: list[str] | None = None) -> None:
     lab = commands.add_parser("element-test", help="compute a laboratory test of a soil law")
     lab.add_argument("law", help="name of the law, such as ModifiedCamClay, or file.py:name")
     lab.add_argument("test", help=", ".join(mpm_dolfinx.ElementTest.KINDS))
-    lab.add_argument("strain", help="axial strain, compression positive, or shear; commas between turning points")
-    lab.add_argument("constants", nargs="*", metavar="name=value", help="constant of the law; commas in vectors")
+    lab.add_argument("strain", help="axial (compression positive) or shear strain; commas separate turning points")
+    lab.add_argument("constants", nargs="*", metavar="name=value", help="constant of the law; a vector has commas")
     lab.add_argument("--steps", type=int, default=100, help="number of steps to each turning point (100)")
     lab.add_argument("--confinement", type=float, default=0.0, help="initial isotropic effective stress, Pa (0)")
     lab.add_argument("--suction", type=float, default=0.0, help="initial suction, Pa (0)")

@@ -29,8 +29,8 @@ PRIVATE = set(
     "met meets passed here there went back lost due wanted asked".split()
 )
 """Verbs, participles and adverbs that name values in place of a noun of the field."""
-ENTRY = re.compile(r"^( *)(\S.{0,60}[^.:\s])\n\1 {4}(?=\S)", re.M)
-"""A name of a list of parameters, and its text below."""
+ENTRY = re.compile(r"^( *)(\S(?:.{0,90}[^.:\s])?)\n\1 {4}(?=\S)|^( *)(?=\w[\w, ]* : )", re.M)
+"""A name of a list of parameters, and its text below or after a colon."""
 SHORTEST = 4
 """Words of the shortest sentence that is drawn."""
 PARTS = {
@@ -158,6 +158,11 @@ def whole_sentences(paragraph: str) -> list[str]:
     return [shown[part] for part in whole]
 
 
+def entry(found: re.Match) -> str:
+    """Return the beginning of a parameter as that of a paragraph."""
+    return f"\n{found[1]}{found[2]}: " if found[2] else f"\n{found[3]}"
+
+
 def places() -> list[tuple[str, str]]:
     """Return the places, file:line, and all sentences of docstrings, messages and pages."""
     out = []
@@ -167,7 +172,7 @@ def places() -> list[tuple[str, str]]:
             found = [(1, each) for each in page_paragraphs(source)]
         else:
             tree = ast.parse(source)
-            docs = [(line, each) for line, text in texts(tree) for each in paragraphs(ENTRY.sub(r"\n\1\2: ", text))]
+            docs = [(line, each) for line, text in texts(tree) for each in paragraphs(ENTRY.sub(entry, text))]
             found = docs + [(line, " ".join(text.split())) for line, text in messages(tree)]
         out += [(place(path, source, line, each), each) for line, text in found for each in whole_sentences(text)]
     return out

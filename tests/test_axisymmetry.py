@@ -349,7 +349,7 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits_and_keeps_its_water(
     assert whole.result.balance < 1e-8 and whole.points.data["hardened"].max() > 1e-4
     for name in ("F", "corners", "pressure"):
         assert np.array_equal(getattr(whole.points, name), getattr(resumed.points, name))
-    with pytest.raises(ValueError, match="axisymmetric: True there, None here"):
+    with pytest.raises(ValueError, match="axisymmetric: True in file, None here"):
         grid = mpm.Grid([0, 0], [1.0, 1.5], [6, 9])
         body = mpm.box(grid, [0, 0], [0.7, 1.2])
         sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)

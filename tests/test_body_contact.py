@@ -265,13 +265,13 @@ def test_what_are_no_contacts_is_refused():
         scene(boxes[:2], mpm.Contact(0, [0, 1]))
     with pytest.raises(ValueError, match=r"body 2 is in no group, must be in one"):
         scene(boxes, mpm.Contact(0, 1))
-    with pytest.raises(ValueError, match=r"groups \(0,\) and \(2,\) have 0, must have one contact"):
+    with pytest.raises(ValueError, match=r"groups \(0,\) and \(2,\) have 0 contacts, must have one"):
         scene(boxes, mpm.Contact(0, 1), mpm.Contact(1, 2))
     with pytest.raises(ValueError, match=r"body 1 is in the groups .*, must be in one; name all"):
         scene(boxes, mpm.Contact(0, [1, 2]), mpm.Contact(0, 1))
     with pytest.raises(ValueError, match=r"bodies 0 and 1: overlap at .* by 0.2 m, must not"):
         scene([boxes[0], deep], mpm.Contact(0, 1))
-    with pytest.raises(ValueError, match=r"2 groups of bodies have this side, must be one; limit it"):
+    with pytest.raises(ValueError, match=r"2 groups of bodies have this side, must be one; limit each"):
         scene(boxes[:2], mpm.Contact(0, 1), conditions=[mpm.Traction("left", 0.0)])
     with pytest.raises(ValueError, match=r"quadrature 'point': must be domain with contacts"):
         scene(boxes[:2], mpm.Contact(0, 1), numerics=mpm.Numerics(quadrature="point"))

@@ -7,15 +7,15 @@ import pytest
 CEILINGS = {
     "ad hoc named numbers": 100,
     "rules among numbers in functions": 3,
-    "imports a file, mean": 5.61,
+    "imports a file, mean": 5.55,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 14,
     "assignments of three and more values": 19,
-    "changes of hidden state": 6,
+    "changes of hidden state": 0,
     "files that name a condition's class, most": 6,
-    "lines of the package": 37338,
+    "lines of the package": 37318,
 }
 
 HALF = 'Halving this value changes the result of scene "bank" in tests/plateaus.py by'

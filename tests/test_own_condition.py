@@ -9,7 +9,6 @@ import ufl
 from helpers import SOFT, refused_in_one_line
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.conditions.sides import gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 
 STIFFNESS = 2e6  # Pa/m
@@ -46,7 +45,7 @@ class SpringsOfStage(mpm.Acting):
         p, grid, forms = place.cut.surface(self.faces), self.setting.grid, self.setting.forms(Forms)
         moved = p.now(place.points) - p.origin(place.points)
         rows = np.concatenate([np.linalg.norm(p.area(place.points), axis=1)[:, None], moved], axis=1)
-        cell, x, values = gathered(grid, [(p.cell, p.x, rows)], 1 + grid.dim)
+        cell, x, values = grid.gathered([(p.cell, p.x, rows)], 1 + grid.dim)
         return SpringLoads(self, forms, forms.points.at(cell, x, values[:, 0], before=values[:, 1:]))
 
 
@@ -114,7 +113,7 @@ class SkinOfStage(mpm.Feeding):
 
     def placed(self, wet):
         p = wet.cut.surface(self.faces)
-        cell, x, area = gathered(self.grid, [(p.cell, p.x, p.area(wet.points))], self.grid.dim)
+        cell, x, area = self.grid.gathered([(p.cell, p.x, p.area(wet.points))], self.grid.dim)
         reach = x - self.grid.midpoints[cell] - wet.contents.centroid[cell]
         return SkinFeeds(self, wet.contents.slot(cell), area, reach)
 

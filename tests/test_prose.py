@@ -46,6 +46,11 @@ def test_drawn_sentences_stand_where_they_are_said_to():
         assert set(words[0]) <= set(words[1])
 
 
+def test_parameters_are_drawn_one_by_one():
+    text = prose.ENTRY.sub(prose.entry, "x\n    Position of a node.\nz, y : m; height\nt : s; time")
+    assert prose.paragraphs(text) == ["x: Position of a node.", "z, y : m; height", "t : s; time"]
+
+
 def test_private_names_only_become_fewer():
     names = prose.private_names(prose.ast.parse(path.read_text()) for path in prose.files("mpm_dolfinx"))
     assert names.total() <= PRIVATE_NAMES

@@ -253,13 +253,13 @@ def test_a_checkpoint_of_another_version_is_refused(checkpoint, monkeypatch):
 
 
 OTHER_SCENES = {
-    "material": ({"material": mpm.Hencky(1e7 / 3, 6e6, conductivity=1e-4)}, "shear of material 0: 5000000.0 there, 60"),
-    "law": ({"material": mpm.NeoHookean(1e7 / 3, 5e6, conductivity=1e-4)}, "material 0: Hencky there, NeoHookean here"),
-    "grid": ({"h": 0.05}, r"grid cells: \[20, 20\] there, \[24, 24\] here"),
+    "material": ({"material": mpm.Hencky(1e7 / 3, 6e6, conductivity=1e-4)}, "shear of material 0: 5000000.0 in file"),
+    "law": ({"material": mpm.NeoHookean(1e7 / 3, 5e6, conductivity=1e-4)}, "material 0: Hencky in file, NeoHookean"),
+    "grid": ({"h": 0.05}, r"grid cells: \[20, 20\] in file, \[24, 24\] here"),
     "place": ({"offset": 0.6}, "checksum of the positions of body 0"),
-    "fluid": ({"fluid": mpm.Fluid(bulk=1e9)}, "bulk of fluid: 2200000000.0 there, 1000000000.0 here"),
-    "dry": ({"fluid": False}, "fluid: Fluid there, None here"),
-    "quadrature": ({"numerics": mpm.Numerics(quadrature="point")}, "quadrature: domain there, point here"),
+    "fluid": ({"fluid": mpm.Fluid(bulk=1e9)}, "bulk of fluid: 2200000000.0 in file, 1000000000.0 here"),
+    "dry": ({"fluid": False}, "fluid: Fluid in file, None here"),
+    "quadrature": ({"numerics": mpm.Numerics(quadrature="point")}, "quadrature: domain in file, point here"),
 }
 
 

@@ -16,7 +16,7 @@ from interrupting import interrupted
 import mpm_dolfinx as mpm
 from mpm_dolfinx.base.histories import Row
 from mpm_dolfinx.io.checkpoint import save
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import StepControl
 
 SAND = mpm.DruckerPrager(
     bulk=2e7,

@@ -14,7 +14,7 @@ from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.simulation import simulation
 from mpm_dolfinx.simulation.step_size import StepSize
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import StepControl
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 OPEN = mpm.Drained("top")
@@ -168,7 +168,7 @@ def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
         return eta * ufl.inner(ufl.sym(points.grad(velocity)), ufl.sym(points.grad(v))) * points.dx
 
     for options in ({"fluid": False}, {"material": replace(SOFT, conductivity=0.0)}):
-        with pytest.raises(ValueError, match=r"without flow velocities have no error estimate, must be dt"):
+        with pytest.raises(ValueError, match=r"without flow of fluid, velocities have no error estimate, must be dt"):
             loaded(load, cells=2, terms=[damper], **options).run(20.0, rtol=1e-2)
 
     def error(steps):
@@ -396,9 +396,10 @@ def test_steps_whose_growth_fails_again_and_again_wait_longer_and_longer():
 
 
 def test_what_is_as_sudden_in_every_step_is_no_jump_of_the_loads():
-    rule, found = StepSize(1.0, 1.0), StepControl(change=100.0)
-    report = Report(first=10.0, sudden=10.0)
+    rule, found = StepSize(1.0, 1.0), StepControl(change=[100.0])
+    report = Report(first=np.array([10.0]), sudden=np.array([10.0]))
     assert rule.refused(1.0, report, found) == 0.5 and rule.next(0.5, report, replace(found, small=0.5), False) == 0.5
-    again = replace(found, first=10.0, small=0.5)  # Pa/s, in the step before
-    assert rule.refused(1.0, report, again) == 1.0 and rule.next(0.5, replace(report, sudden=5.0), again, False) == 1.0
-    assert rule.refused(1.0, replace(report, sudden=21.0), again) == 0.5
+    again = replace(found, first=[10.0], small=0.5)  # Pa/s, in the step before
+    assert rule.refused(1.0, report, again) == 1.0
+    assert rule.next(0.5, replace(report, sudden=np.array([5.0])), again, False) == 1.0
+    assert rule.refused(1.0, replace(report, sudden=np.array([21.0])), again) == 0.5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The families of `extreme_cases`: extreme property, scenes, exact solutions, and bounds of the errors."""
+"""The families of `extreme_cases`: scenes with one extreme property each, exact solutions, and bounds of the errors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ from mpm_dolfinx.verification.exact import SelfWeightColumn
 
 @dataclass(frozen=True)
 class Family:
-    """Scenes of one kind: settings and scenes, and the bound of their errors."""
+    """Scenes with the same extreme property.
+
+    cases: generator of (setting, scene); bound: largest allowed error of a scene.
+    """
 
     cases: Callable[[], Iterator[tuple[str, Make]]]
     bound: float
@@ -55,26 +58,31 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
+    """Return the powers of ten from 10^low to 10^high; step: of the exponent."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
 @family(0.01)
 def conductivity():
-    """Beam that drains at its end, k = 1e-14 ... 1e2 m/s: tip against finite elements."""
+    """Beam that drains at its free end, k = 1e-14 to 1e2 m/s: tip against finite elements."""
     for k in decades(-14, 2):
         yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
 
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures; exact settlement."""
+    """Terzaghi's layer, dt = 1e-9 to 1e9 s: mean error of the pressures, error of the settlement; exact."""
     water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
 
 
 def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the error relative to the load, 1e-5 M: a sum of modes, averaged over the cells."""
+    """Return the larger of two errors: mean of |p - exact| / load over the points, and error of the settlement.
+
+    The error of the settlement is divided by the final settlement.  h: cell size, m.  The load is 1e-5 M.  The exact
+    pressures are sums of modes, averaged over each cell.
+    """
     m = (np.arange(20000) + 0.5) * np.pi
     left = np.exp(-(m**2) * s.t * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M)
     middle = (np.floor(s.points.x[:, 1:] / h) + 0.5) * h
@@ -86,14 +94,14 @@ def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.01)
 def time_step_of_a_beam():
-    """Beam that drains at its end, dt = 1e-9 ... 1e9 s: tip against finite elements."""
+    """Beam that drains at its free end, dt = 1e-9 to 1e9 s: tip against finite elements."""
     for dt in decades(-9, 9, 3):
         yield f"dt = {dt:.0e} s", Beam(SOIL, WATER, end=8 * dt)
 
 
 @family(0.01)
 def fluid_bulk():
-    """Sealed column and beam, K_w = 1e4 Pa ... infinity: exact pressure, settlement; tip against finite elements."""
+    """Sealed column and beam, K_w = 1e4 Pa to infinity: exact pressure and settlement; tip against finite elements."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -107,7 +115,10 @@ def fluid_bulk():
 
 @family(0.02)
 def combined():
-    """Beam, k and dt of 1e-14 m/s, 1e-9 s or 1e2 m/s, 1e9 s, any K_w, nu: tip against finite elements of the limit."""
+    """Beam, undrained or drained by extreme k and dt, three K_w, two nu: tip against finite elements of the limit.
+
+    The undrained limit is a sealed beam, the drained limit a beam without water.
+    """
     for bulk in (1e4, 2.2e9, inf):
         for nu in (0.0, 0.499):
             sealed = Beam(soil(nu=nu, conductivity=0), mpm.Fluid(bulk), drained=())
@@ -117,13 +128,13 @@ def combined():
 
 
 def beside(beam: Beam, limit: Beam) -> Scene:
-    """Return a beam's scene with the finite elements of another one as its reference."""
+    """Return the scene of `beam`; its reference is the finite element solution of `limit`."""
     return replace(beam(), error=lambda s, r: off(tip(r), limit.elements()))
 
 
 @family(0.02)
 def poisson():
-    """Beam without and with water, nu = 0 ... 0.499: tip against finite elements."""
+    """Beam with and without water, nu = 0 to 0.499: tip against finite elements."""
     for nu in (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.499):
         truth = (80, 32) if nu > 0.45 else (40, 16)
         yield f"drained, nu = {nu}", Beam(soil(nu=nu), truth=truth)
@@ -139,13 +150,13 @@ def steps():
             yield f"undrained, {n} steps", Beam(soil(conductivity=0), WATER, drained=(), steps=n, ramp=1.0)
 
 
-CUTS = {"on a grid line": 0.5, "within a cell": 0.50625}  # m; cells of 1/80 m
-DROP = 1e-2  # Pa: so little that no layer leaves its place
+CUTS = {"on a grid line": 0.5, "within a cell": 0.50625}  # heights of the interface, m; cells of 1/80 m
+DROP = 1e-2  # pressure difference, Pa, too small to move the layers
 
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, ratio of k 1e-8 ... 1e8: pressures over their difference, exact."""
+    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures / pressure difference, exact."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -155,7 +166,7 @@ def contrast_of_conductivity():
 
 
 def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the error of the pressures in the cells for two layers in series."""
+    """Return the largest error of the pressures in the cells / pressure difference; cut: height of the interface, m."""
     cells = s.cells()
     y = cells.x[:, 1]
     lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
@@ -164,7 +175,7 @@ def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def contrast_of_stiffness():
-    """Two layers under a load, ratio of E 1e-6 ... 1e6, also under tiny loads: exact settlement."""
+    """Two layers under large and tiny loads, ratio of E 1e-6 to 1e6: exact settlement."""
     for name, cut in CUTS.items():
         for ratio in decades(-6, 6, 1 if cut == 0.5 else 2):
             for strain in (1e-2, 1e-6, 1e-10) if ratio in (1e-6, 1e6) else (1e-2,):
@@ -177,7 +188,7 @@ def contrast_of_stiffness():
 
 @family(0.01)
 def offset():
-    """Beam at 20 random positions on the grid, also with its end within a cell: tip against finite elements."""
+    """Beam at 20 random positions on the grid, with its end within a cell: tip against finite elements."""
     for i, (x, y) in enumerate(np.random.default_rng(0).random((20, 2))):
         place = {"offset": float(y), "h": (1 / (19 + float(x)), 0.05)}
         yield f"{i}: {x:.3f}, {y:.3f} of a cell", Beam(soil(conductivity=1e-5), WATER, **place)
@@ -185,7 +196,7 @@ def offset():
 
 @family(0.02)
 def rotation():
-    """Square rotated by 0 ... 90 degrees under load: exact volume, pressure; mean pressure against a finer grid."""
+    """Loaded square, rotated by 0 to 90 degrees: exact volume, pressure; mean pressure against a finer grid."""
     K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
     J = stretch(1e5 / (2 * K)) ** 2
     a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
@@ -201,33 +212,33 @@ DRAINING = {"cells": 24, "fluid": WATER, "end": 0.4, "steps": 16, "drained": ("l
 
 
 def held(s: mpm.Simulation) -> float:
-    """Return the mean pressure."""
+    """Return the mean pressure of the points, Pa, weighted by initial volumes."""
     return float(s.points.volume0 @ s.points.pressure / s.points.volume0.sum())
 
 
 @cache
 def half_drained() -> float:
-    """Return the final mean pressure on a fine grid whose lines coincide with the sides of the square."""
+    """Return the final mean pressure, Pa, on a fine grid, whose lines coincide with the sides of the square."""
     scene = square(0, None, **{**DRAINING, "cells": 48})()
     scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
     return held(scene.simulation)
 
 
 def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the error of the mean pressure, relative to the initial pressure."""
+    """Return the error of the mean pressure / initial pressure of 1e5 Pa."""
     return off(held(s), half_drained(), 1e5)
 
 
 @family(0.02)
 def rotation_of_a_beam():
-    """Beam rotated by 5 ... 90 degrees, with prescribed displacements at its end: tip against finite elements."""
+    """Beam rotated by 5 to 90 degrees, with prescribed displacements at its end: tip against finite elements."""
     for angle in (5, 15, 30, 45, 60, 75, 90):
         yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
 
 
 @family(0.01)
 def points_per_cell():
-    """Beam with 1 ... 5 points per cell and direction: tip against finite elements."""
+    """Beam with 1 to 5 points per cell and direction: tip against finite elements."""
     for n in range(1, 6):
         for y in (0.0, 0.3):
             many = {"per_cell": n, "offset": y, "h": (0.025, 0.025)}
@@ -236,7 +247,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Beam and column whose last cell is filled to 1e-10 ... 0.5: tip against finite elements, exact settlement."""
+    """Beam and column, filling of the outermost cells 1e-10 to 0.5: tip against finite elements; exact settlement."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -252,9 +263,10 @@ def few_points():
 
 @family(1.0)
 def thin():
-    """Beam of half a cell, one cell, two cells: error of the tip over that of Q1 elements on as many cells.
+    """Beam half a cell, one or two cells high: error of the tip / error of Q1 elements on as many cells.
 
-    The beam of half a cell has at least two points over its height: with one point it creeps, and a warning says so.
+    The beam that is half a cell high has at least two points over its height.  With one point it would creep, and the
+    package would warn.
     """
     for height, h, cells in ((0.05, 0.1, (10, 1)), (0.1, 0.1, (10, 1)), (0.1, 0.05, (20, 2))):
         for n in (3, 4) if height < h else (2, 3):
@@ -264,7 +276,7 @@ def thin():
 
 
 def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
-    """Return the beam's scene with its error relative to that of Q1 elements."""
+    """Return the scene of the beam; the error of its tip is divided by the error of Q1 elements on `cells` cells."""
     scene = beam()
     bound = off(beam.elements("q1-dg0", cells), beam.elements())
     return replace(scene, error=lambda s, r: off(tip(r), beam.elements()) / bound)
@@ -272,7 +284,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Column under its weight, rho g H / M = 1e-6 ... 10, and wet: exact height; beam: tip against finite elements."""
+    """Column under its weight, dry (rho g H / E = 1e-6 to 10) or wet: exact height; beam: tip against elements."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio
@@ -288,7 +300,7 @@ def weight():
 
 @family(0.01)
 def suction():
-    """Column with an outer pressure p, -10 ... 0.5 M: exact settlement; refused if its pores close or it bursts."""
+    """Column with pore pressure p = -10 to 0.5 M: exact settlement; refused if pores close or without equilibrium."""
     for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
         a = stretch(-ratio) if ratio < exp(-1) else nan
 
@@ -305,8 +317,8 @@ def suction():
 
 @family(0.02)
 def buckling():
-    """Slender cantilever under 0.5 ... 2 times its buckling load: tip against finite elements in 40 steps."""
-    # under more it curls back behind its clamp, where the grid ends
+    """Slender cantilever under 0.5 to 2 times its buckling load: tip against finite elements in 40 steps."""
+    # under a larger load the beam would curl back behind its clamp, where the grid ends
     critical = np.pi**2 * M * 0.1**2 / 12 / 4
     slender = Beam(load=200.0, size=(1.0, 0.1), truth=(40, 4), truth_steps=40, h=(0.0125, 0.0125), ramp=1.0)
     for ratio, n in ((0.5, 40), (0.9, 40), (1.1, 40), (1.1, 1), (1.5, 40), (1.5, 1), (2.0, 40), (2.0, 1)):
@@ -325,7 +337,7 @@ def overload():
 
 
 def pressed(material, load: float) -> Error | None:
-    """Return the error of the settlement under a load, None where no stretch carries it."""
+    """Return the error of the settlement under a load, Pa; None if the load is in equilibrium with no stretch."""
 
     def excess(a):
         lam = material.bulk - 2 * material.shear / 3
@@ -338,7 +350,7 @@ def pressed(material, load: float) -> Error | None:
 
 @family(0.01)
 def units():
-    """Beam of 1e-6 ... 1e6 m, E = 1 ... 1e15 Pa: tip against finite elements of 1 m and 10 MPa."""
+    """Beam of 1e-6 to 1e6 m, or E = 1 to 1e15 Pa: tip against finite elements for 1 m and 10 MPa."""
     exact = Beam().elements()
     for x in decades(-6, 6, 3):
         beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))
@@ -350,15 +362,17 @@ def units():
 
 @family(1e-4)
 def rain():
-    """Column in rain of half of k, of a tenth of that before, k = 1e-12 ... 1e-1 m/s, alpha h = 1e-3 ... 1e3: heads,
-    exact (Gardner's soil over a water table)."""
+    """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: exact heads.
+
+    The rain increases from k / 20 to k / 2.  The soil is Gardner's, and stands on a water table.
+    """
     for k in [*decades(-12, 0, 4), 0.1]:
         for steep in decades(-3, 3):
             yield f"k = {k:.0e} m/s, alpha h = {steep:.0e}", partial(rained, k, steep)
 
 
 def rained(k: float, steep: float) -> Scene:
-    """Return the column in rain of k / 2, and a time in which its heads become steady."""
+    """Return the column under rain of k / 2, until the heads are steady; k: conductivity, m/s; steep: alpha h."""
 
     def steady(share: float, alpha: float, z: np.ndarray) -> np.ndarray:
         return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
@@ -374,14 +388,20 @@ def rained(k: float, steep: float) -> Scene:
 
 @family(1e-4)
 def evaporation():
-    """Column above a water table in air of -1.5 m, k = 1e-12 ... 1 m/s, alpha h = 1e-3 ... 1e2: exact heads."""
+    """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: exact heads.
+
+    The head of the air is -1.5 m.
+    """
     for k in decades(-12, 0, 4):
         for steep in decades(-3, 2):
             yield f"k = {k:.0e} m/s, alpha h = {steep:.0e}", partial(dried, k, steep)
 
 
 def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
-    """Return the column, with water at rest at first; the evaporation exceeds the supply of water."""
+    """Return the column, in which water is initially at rest, and dries at its top; driest: head of the air, m.
+
+    The potential evaporation is larger than the flow from the water table.
+    """
     alpha = 10 * steep
 
     def exact(z: np.ndarray) -> np.ndarray:
@@ -394,9 +414,9 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 
 @family(1e-4)
 def layered_rain():
-    """Two layers, off the grid lines, in rain, ratio of k 1e-3 ... 1e3, alpha h = 1e-2 ... 1e2: exact heads.
+    """Two layers under rain, ratio of k 1e-3 to 1e3, alpha h = 1e-2 to 1e2: exact heads.
 
-    Also in axisymmetry and 3D.
+    The interface is off the grid lines.  One scene is in axisymmetry, and one in 3D.
     """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):
@@ -408,7 +428,11 @@ def layered_rain():
 
 
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
-    """Return a column of two layers; ratio, other: k and alpha of the upper layer, relative to the lower layer."""
+    """Return a column of two layers.
+
+    steep: alpha h of the lower layer; ratio, other: k and alpha of the upper layer, divided by those of the lower
+    layer; grid: see `kind` of `exponential`.
+    """
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2
 
@@ -436,8 +460,9 @@ def exponential(
 ) -> Scene:
     """Return a column of 1 m and ten cells over a water table, of one or two exponential soils, with exact heads.
 
-    k, alpha: conductivities, m/s, and their rates of decrease with the head, 1/m; exact, start: heads, m, by heights,
-    m; edge: lower end of the second soil, m; kind: of the grid.
+    k: conductivity of each soil, m/s.  alpha: rate of its decrease with the suction head, 1/m.  sides: conditions.
+    exact, start: functions of the height, m, that return the final and the initial head, m.  end: end time, s.
+    edge: height of the lower end of the second soil, m.  kind: "plane", "axisymmetric" or "3D".
     """
     h, weight, d = 0.1, 9810.0, 3 if kind == "3D" else 2
     grid = mpm.Grid([0] * d, [h] * (d - 1) + [1 + 2 * h], [1] * (d - 1) + [12], axisymmetric=kind == "axisymmetric")
@@ -461,7 +486,7 @@ def exponential(
         conditions=[mpm.Drained("bottom"), *sides],
         pressure=lambda x: weight * start(x[:, -1]),
         initial_stress=mpm.K0(0.5),
-        numerics=mpm.Numerics(tolerance=1e-9),  # what rounding leaves of a steady state counts in the residual
+        numerics=mpm.Numerics(tolerance=1e-9),  # the residual contains the rounding errors of a steady state
     )
 
     def error(s: mpm.Simulation, result: mpm.Result) -> float:
@@ -473,7 +498,7 @@ def exponential(
 
 @family(1e-3)
 def ponding():
-    """Column of van Genuchten's soil, n = 1.2 ... 7, ponded from initial heads of -1 ... -100 m: exact steady heads."""
+    """Ponded column of van Genuchten's soil, n = 1.2 to 7, initial heads of -1 to -100 m: exact steady heads."""
     for n in (1.2, 2.0, 7.0):
         for head in (-1.0, -10.0, -100.0):
             for alpha in (0.5, 15.0):
@@ -481,7 +506,10 @@ def ponding():
 
 
 def ponded(n: float, head: float, alpha: float) -> Scene:
-    """Return a column that becomes saturated, and drains at its base."""
+    """Return a column of 1 m, ponded by 0.1 m of water until it is saturated, and drained at its base.
+
+    n, alpha: van Genuchten's parameters, -, 1/m; head: initial head, m.
+    """
     law = mpm.VanGenuchten(9810.0 / alpha, residual=0.1, n=n, air_entry=100.0)
     soil = mpm.LinearElastic(1e9, 5e8, porosity=0.4, conductivity=1e-5, retention=law)
     grid = mpm.Grid([0, 0], [0.1, 1.2], [1, 12])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scenes of `extreme_cases`: a cantilever, a column, a square in a corner; on one process."""
+"""The scenes of `extreme_cases`: a cantilever, a column, a square in a corner of the grid; on one process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def soil(young: float = 1e7, nu: float = 0.0, conductivity: float = 1e-4, law=mp
 
 
 SOIL = soil()
-M = SOIL.oedometric  # Pa; nu = 0, so it is Young's modulus
+M = SOIL.oedometric  # Pa; equal to Young's modulus, because nu = 0
 WATER, INCOMPRESSIBLE = mpm.Fluid(), mpm.Fluid(bulk=inf)
 
 
@@ -31,7 +31,10 @@ Error = Callable[[mpm.Simulation, mpm.Result], float]
 
 @dataclass
 class Scene:
-    """A run to its `end` (s), and the error of its result; without `error` there is no equilibrium."""
+    """A simulation to run until `end`, s, in equal steps.
+
+    error: function that returns the error of the simulation and its result; None: the scene has no equilibrium.
+    """
 
     simulation: mpm.Simulation
     end: float
@@ -44,7 +47,7 @@ Make = Callable[[], Scene]
 
 
 def off(measured, exact, scale: float | None = None) -> float:
-    """Return the largest difference, over `scale` or the largest exact value."""
+    """Return the largest difference, divided by `scale`, or by default by the largest exact value."""
     return float(np.abs(np.subtract(measured, exact)).max() / (np.abs(exact).max() if scale is None else scale))
 
 
@@ -54,12 +57,12 @@ def tip(result: mpm.Result) -> np.ndarray:
 
 
 def settled(exact: float) -> Error:
-    """Return the error of a settlement."""
+    """Return a function that returns the relative error of the first probe's vertical displacement."""
     return lambda s, r: off(tip(r)[1], exact)
 
 
 def turned(x: np.ndarray, angle: float) -> np.ndarray:
-    """Return vectors (..., 2) turned by an angle (degrees)."""
+    """Return vectors (..., 2) rotated by an angle, degrees, counterclockwise."""
     c, s = cos(radians(angle)), sin(radians(angle))
     return x @ np.array([[c, s], [-s, c]])
 
@@ -73,7 +76,7 @@ def place(s: mpm.Simulation, corners: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Beam:
-    """A cantilever held at its left end; its tip is compared with that of Taylor-Hood elements."""
+    """A cantilever, clamped at its left end; its tip displacement is compared with that of Taylor-Hood elements."""
 
     material: mpm.materials.Skeleton = SOIL
     fluid: mpm.Fluid | None = None
@@ -82,15 +85,15 @@ class Beam:
     weight: float = 0.0  # m/s^2
     drained: tuple[str, ...] = ("right",)
     end: float = 1.0  # s
-    ramp: float = 0.25  # share of the time in which the loads are raised
+    ramp: float = 0.25  # time in which the loads increase, divided by `end`
     steps: int = 8
     size: tuple[float, float] = (1.0, 0.4)  # m
     h: tuple[float, float] = (0.05, 0.05)
-    offset: float = 0.5  # of the underside from a grid line, cells
+    offset: float = 0.5  # distance of the underside from a grid line, divided by the cell size
     per_cell: int = 2
-    angle: float = 0.0  # degrees; turned about the middle of its left end, all loads with it
+    angle: float = 0.0  # degrees: rotation of beam and loads about the middle of the left end
     truth: tuple[int, int] = (40, 16)  # Taylor-Hood elements
-    truth_steps: int = 8  # of theirs, where water does not drain meanwhile
+    truth_steps: int = 8  # steps of these elements if no water drains, otherwise `steps`
 
     def physics(self) -> dict:
         """Return the conditions that material points and finite elements share."""
@@ -124,7 +127,7 @@ class Beam:
         return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
 
     def elements(self, element: str = "taylor-hood", cells: tuple[int, int] | None = None) -> np.ndarray:
-        """Return the displacement (2,) of the tip by finite elements, which are independent of the grid."""
+        """Return the displacement (2,), m, of the tip of the unrotated beam, computed with finite elements."""
         steps = self.steps if self.fluid and self.drained else self.truth_steps
         seen = replace(self, steps=steps, h=(1, 1), offset=0, per_cell=0, angle=0, truth=cells or self.truth)
         return finite_elements(seen, element)
@@ -132,13 +135,17 @@ class Beam:
 
 @cache
 def finite_elements(beam: Beam, element: str) -> np.ndarray:
-    """Return the displacement (2,) of the tip."""
+    """Return the displacement (2,), m, of the tip of the beam with `beam.truth` finite elements."""
     fem = BiotFEM([0, 0], beam.size, beam.truth, beam.material, walls={"left": "xy"}, element=element, **beam.physics())
     return tip(fem.run(beam.end, beam.end / beam.steps, probes=[[beam.size[0], beam.size[1] / 2]]))
 
 
 def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, load=0.0, room=2, **physics) -> Make:
-    """Return a column one cell wide between smooth walls, of layers (material, top), with a load (Pa) on its top."""
+    """Return a function that makes a column, one cell wide, between smooth walls.
+
+    layers: (material, height of the top, m), from below.  h: cell size, m.  load: on the top, Pa.  room: number of
+    empty cells above the column.
+    """
 
     def make() -> Scene:
         tops = [0.0, *(top for _, top in layers)]
@@ -163,12 +170,15 @@ def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, l
 
 
 def stretch(ratio: float) -> float:
-    """Return the stretch a of a column of Hencky's law under a load q = ratio M: M ln(a) / a = -q."""
+    """Return the stretch a of a column with Hencky's law under a load q = ratio M, from M ln(a) / a = -q."""
     return float(np.exp(-lambertw(ratio).real))
 
 
 def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4, fluid=None, drained=()) -> Make:
-    """Return a square of 0.6 m, turned by an angle (degrees) in the corner of two walls, under 1e5 Pa all around."""
+    """Return a function that makes a square of 0.6 m, under 1e5 Pa on all sides, in the corner between two walls.
+
+    angle: rotation of the square, degrees.  drained: names of its drained sides.
+    """
 
     def make() -> Scene:
         grid = mpm.Grid([0, 0], [1.2, 1.2], [2 * cells, 2 * cells])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Formulas of pages as MathML, which browsers draw without a script, and links from public names to the reference."""
+"""Convert formulas of pages to MathML, which browsers draw without a script; link public names to the reference."""
 
 import re
 from pathlib import Path
@@ -11,12 +11,12 @@ FOUND = documented(Path(__file__).with_name("pages"))
 
 
 def on_page_markdown(markdown: str, **_) -> str:
-    """Return a page whose $$ formulas are MathML."""
+    """Return the page with $$ formulas converted to MathML."""
     return re.sub(r"\$\$(.+?)\$\$", lambda m: convert(m[1].strip(), display="block"), markdown, flags=re.S)
 
 
 def on_page_content(html: str, page, **_) -> str:
-    """Return a page whose public names in code, outside of links and headings, lead to the reference."""
+    """Return the page with links to the reference at public names in code, except in links and headings."""
     up = "../" * page.url.count("/")
 
     def linked(m: re.Match) -> str:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Lay the pages of the reference into a folder: `python demos/reference/pages.py FOLDER`.
 
-Pages and the files that they link to keep their places.  The tutorial and the short examples become pages.
+Pages, and the files that pages link to, keep their relative paths.  The tutorial and the short examples become pages.
 """
 
 import re
@@ -21,7 +21,7 @@ def parts(path: Path) -> tuple[str, str]:
 
 
 def tutorial(path: Path) -> str:
-    """Return the tutorial as a page: comments that begin a line are text, the rest is code."""
+    """Return the tutorial as a page: lines that begin with a comment become text, all other lines become code."""
     text, code = parts(path)
     out = [f"# Tutorial\n\n{text}\n"]
     for block in re.findall(r"(?:^#.*\n?)+|(?:^(?!#).*\n?)+", code, re.M):
@@ -45,20 +45,20 @@ def short(folder: Path) -> str:
 
 
 def documented(folder: Path) -> dict[str, str]:
-    """Return the public names of the reference, with the stems of their pages."""
+    """Return the public names of the reference, each with the stem of the file that documents it."""
     texts = {path.stem: path.read_text() for path in folder.glob("*.md")}
     return {name: stem for stem, text in texts.items() for name in re.findall(r"^::: mpm_dolfinx\.(\w+)$", text, re.M)}
 
 
 def names(folder: Path) -> str:
-    """Return a page of all public names with links to them, which a browser finds without a server."""
+    """Return a page of all public names, as links.  Unlike the search, the page needs no server."""
     found = documented(folder)
     rows = [f"* [`{name}`]({found[name]}.md#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
     return "# All names\n\n" + "\n".join(rows) + "\n"
 
 
 def lay(out: Path) -> None:
-    """Lay all pages into a folder, which is made anew."""
+    """Lay all pages into a folder, whose earlier contents are removed."""
     shutil.rmtree(out, ignore_errors=True)
     for pattern in (*PAGES, *LINKED):
         for path in ROOT.glob(pattern):

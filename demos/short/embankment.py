@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settlement under the middle of an embankment that is built on soft clay, which then consolidates."""
+"""Settlement under the middle of an embankment on soft clay, which consolidates after the construction."""
 
 import mpm_dolfinx as mpm
 

@@ -12,7 +12,7 @@ probe = mpm.probes([beam], [[2, 0.25]])
 with mpm.Writer(simulation, "beam", grid=True) as writer:  # beam/points.pvd and beam/grid.pvd for ParaView, history.csv
     result = simulation.run(t_end=1, dt=0.2, probes=probe, observe=writer)
 mpm.one_file("beam")  # beam/points.xdmf: all times in one file
-table = result.to_dataframe()  # a row for each time
+table = result.to_dataframe()  # one row for each output time
 table.to_csv("beam.csv")
 print(f"tip deflection: {-1000 * table['uy_0'].iloc[-1]:.1f} mm")
 mpm.plot(simulation, "stress_xx").figure.savefig("export.png", bbox_inches="tight")

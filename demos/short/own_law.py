@@ -13,7 +13,7 @@ class Fung(mpm.NeoHookean):
     stiffening: mpm.Field = 0.0  # a new constant of the law, -
 
     @staticmethod
-    def energy(F, shear, stiffening):  # Pa, of the deformation gradient; the stress is its derivative
+    def energy(F, shear, stiffening):  # Pa; F: deformation gradient; the stress is the derivative of the energy
         E = (F.T * F - ufl.Identity(2)) / 2
         return shear / stiffening * (ufl.exp(stiffening * ufl.inner(E, E)) - 1)
 

@@ -9,7 +9,7 @@ STIFFNESS = 2e6  # N/m^3
 
 
 def springs(points, u):  # energy of the springs; its derivative is added to the balance of momentum
-    displacement = points.displacement + points.value(u)  # displacement since the start, with that of this step
+    displacement = points.displacement + points.value(u)  # since the start, including this step
     return STIFFNESS / 2 * ufl.inner(displacement, displacement) * points.dx
 
 

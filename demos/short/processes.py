@@ -17,7 +17,7 @@ simulation = mpm.Simulation(
 )
 middle = mpm.probes([ground], [[0, 2]])
 result = simulation.run(t_end=1e5, dt=2e4, probes=middle)  # histories are the same on all processes
-axes = mpm.plot(simulation, "displacement_y")  # all processes must call this; the first process draws
+axes = mpm.plot(simulation, "displacement_y")  # all processes must call `plot`; the first process draws
 if grid.comm.rank == 0:
     axes.figure.savefig("processes.png", bbox_inches="tight")
     print(f"settlement: {-1000 * result.displacement[-1, 0, 1]:.6f} mm")

@@ -5,7 +5,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-RADIUS, STRENGTH, DEPTH = 0.5, 1e3, 2e4  # m, Pa, Pa: the last is the pressure at the depth of the bar
+RADIUS, STRENGTH, DEPTH = 0.5, 1e3, 2e4  # m, Pa, Pa: overburden pressure at the depth of the bar
 grid = mpm.Grid(lower=[0, -2.5], upper=[2.5, 2.75], cells=[20, 42])
 angle = np.linspace(-np.pi / 2, np.pi / 2, 25)
 arc = [(RADIUS * np.cos(a), RADIUS * np.sin(a)) for a in angle]
@@ -22,7 +22,7 @@ simulation = mpm.Simulation(
     walls={"left": "x", "right": "x", "bottom": "y"},
     conditions=[bar, mpm.Pressure("top", lambda t: DEPTH * min(1, t))],
 )
-simulation.run(t_end=1, dt=1)  # a pressure on the clay, so that no gap opens behind the bar
+simulation.run(t_end=1, dt=1)  # the pressure keeps the gap behind the bar closed
 simulation.run(t_end=2, dt=0.1)  # the bar is pushed by a tenth of its diameter
 force = -2 * simulation.tool_forces["bar"][1]  # N/m
 print(f"resistance: {force / (2 * RADIUS * STRENGTH):.2f} of the strength (Randolph and Houlsby: 11.94)")

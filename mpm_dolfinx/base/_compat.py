@@ -44,7 +44,7 @@ def box_mesh(
     Parameters
     ----------
     cells : (n, 2^d)
-        Node numbers of the cells that this process contributes; the first axis varies fastest.
+        Global node indices of the cells that this process contributes.  Within a cell, the first axis varies fastest.
     x : (m, d), m
         Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
     ranks, offsets
@@ -53,14 +53,14 @@ def box_mesh(
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
     if OLD:
-        # FFCx sets this variant when it compiles its first form; later libraries would then have other names
+        # FFCx would add this variant itself after its first form, and so change the names of later libraries
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1, variant="equispaced"))
         ghosts = mesh.GhostMode.shared_facet
         lists = cpp.graph.AdjacencyList_int32(*where)
         return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
     domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
     lists = graph.adjacencylist(*where)
-    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap those of a partitioner
+    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps lists, but does not unwrap the result of a partitioner
     return mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=lambda *_: lists)
 
 
@@ -75,7 +75,7 @@ def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, .
 def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
     cell = msh.ufl_cell()
     if family == "DG" and cell.cellname() in ("quadrilateral", "hexahedron"):
-        family = "DQ"  # UFL renames DG on boxes, but prints a line
+        family = "DQ"  # UFL would rename DG itself, but print a line about it
     if len(shape) == 2:
         return ufl.TensorElement(family, cell, degree, shape=shape)
     if len(shape) == 1:
@@ -148,7 +148,7 @@ class CompiledForm:
     """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 
     A cell may occur several times in the list; the kernel is then called once for each entry.  Ghost cells are not
-    allowed, because 0.5 silently skips them.  0.5 needs mesh tags, later releases a list of entities.
+    allowed, because dolfinx 0.5 silently skips them.  This release needs mesh tags, later ones a list of entities.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ class CompiledForm:
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`, without summing ghosts.  `rows`, one per entity, replace dolfinx's coefficients."""
+        """Add the vector to `b`, without communication.  `rows`, one per entity, replace dolfinx's coefficients."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
@@ -235,7 +235,7 @@ class CompiledForm:
 
     @cached_property
     def _keys(self) -> list[tuple]:
-        """Keys of the coefficients: numbers of the integrals in 0.11, subdomain ids in earlier releases."""
+        """Keys of the coefficients: indices of the integrals in dolfinx 0.11, subdomain ids in earlier releases."""
         return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 
@@ -256,6 +256,6 @@ def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
 
 
 def compiled(form: ufl.Form):
-    """Return the compiled form `fem.form(form)`, made by the package's compiler."""
+    """Return `fem.form(form)`, compiled within the context `compiler`."""
     with compiler(_mesh_of(form).comm):
         return fem.form(form)

@@ -43,9 +43,9 @@ logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run, each by the cache folder that it replaces, because that folder is not writable."""
+"""Temporary folders of this run.  Each key is the cache folder that is not writable, and is replaced."""
 _warnings: dict[Path, str] = {}
-"""Warnings not yet given, by temporary folder.  The first compilation in a folder gives its warning."""
+"""Warnings still to be issued, by temporary folder.  The first compilation in a folder issues the warning."""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
     Raises
     ------
     OSError
-        On all processes, in one line: unreadable settings, no writable folder, or failure of the C compiler.
+        Settings are unreadable, no folder is writable, or the C compiler fails.  All processes raise the error.
     """
     folder = at_root(comm, _folder)
     messages = [""]
@@ -66,7 +66,7 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
             yield
     except Exception as error:
         raised = error
-    message = first(comm, messages[-1])  # dolfinx reports to the other processes only that one has failed
+    message = first(comm, messages[-1])  # dolfinx does not report the cause to the other processes
     if message:
         raise OSError(message) from raised
     if raised is not None:
@@ -77,7 +77,7 @@ MAKERS = [name for name in ("compile_forms", "compile_elements") if hasattr(libr
 
 
 def _folder() -> Path:
-    """Return the folder for libraries: dolfinx's cache or, if it is not writable, a temporary folder of this run."""
+    """Return the folder for libraries: dolfinx's cache, or a temporary folder if the cache is not writable."""
     try:
         _ffcx_settings()
         cache = _settings()["cache_dir"]
@@ -178,14 +178,14 @@ def _is_complete(place: Path, name: str) -> bool:
         return False
     with open(library, "rb") as f:
         head = f.read(64)
-    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not a Linux library: other loaders may check themselves
+    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not a Linux library: loaders of other systems may check the file
         return len(head) == 64
     (table,), (size, count) = struct.unpack_from("=Q", head, 0x28), struct.unpack_from("=2H", head, 0x3A)
     return library.stat().st_size >= table + size * count  # linkers write the section table last
 
 
 def _publish(workshop: Path, folder: Path) -> None:
-    """Move a library into the cache, unless it exists there or another program is compiling it."""
+    """Move a library into the cache, unless another program is compiling it there."""
     (source,) = workshop.glob("*.c")
     mark, name = folder / source.name, source.stem
     ready = mark.with_suffix(".c.cached")

@@ -21,10 +21,16 @@ class Latest(Generic[T]):
     """Cache of the last value.
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
+
+    Parameters
+    ----------
+    derived
+        Caches of values that depend on this value; they are emptied together with this one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *derived: Latest) -> None:
         self._entry: tuple[Any, T] | None = None
+        self._derived = derived
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
         """Return the value for a key; compute the value again if the key differs from the last key.
@@ -41,6 +47,8 @@ class Latest(Generic[T]):
         other = self._entry is None or not same(self._entry[0], key)
         if other if comm.size == 1 else over_all(comm, other) > 0:
             self._entry = None
+            for one in self._derived:
+                one.clear()
             self._entry = key, make()
         return self._entry[1]
 
@@ -50,8 +58,10 @@ class Latest(Generic[T]):
         return None if self._entry is None else self._entry[1]
 
     def clear(self) -> None:
-        """Remove the value."""
+        """Remove the value, and the values that depend on it."""
         self._entry = None
+        for one in self._derived:
+            one.clear()
 
 
 class Keyed:

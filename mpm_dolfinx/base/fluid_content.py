@@ -7,8 +7,8 @@ porosity is n = 1 - (1 - n0) / J.  Therefore S J = a J + b is linear in J, with 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
-computed as the change of this mass, divided by rho at the mean pressure of the step.  This change is
-second-order accurate for any path, and zero without flow for any step size.
+computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
+second-order accurate for any path.  In a step of any size without flow of fluid, it gives exactly zero.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi with
 pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  The density between two pressures is the logarithmic mean
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import EPSILON
 
 SERIES = (120 * EPSILON) ** 0.25
-"""Argument z below which sinh(z) / z is computed as 1 + z^2 / 6.  Source: exact, the next term is z^4 / 120."""
+"""Argument z below which sinh(z) / z is computed as 1 + z^2 / 6.  Source: the next term, z^4 / 120, is epsilon here."""
 
 
 def change_of_content(alpha, a, storage, J, dp):
@@ -32,8 +32,10 @@ def change_of_content(alpha, a, storage, J, dp):
 
     Parameters
     ----------
-    alpha, a, storage
-        Biot coefficient; storage coefficient at a porosity of one; storage coefficient at the start of the step, 1/Pa.
+    alpha
+        Biot coefficient.
+    a, storage
+        Storage coefficients, 1/Pa: `a` at a porosity of one, `storage` at the start of the step.
     J
         Volume ratio of the step.
     dp
@@ -67,12 +69,12 @@ def mass_potential_form(p, compliance):
 
 
 def density_between(p0, p1, compliance):
-    """Return the logarithmic mean of the densities at two pressures, relative to zero pressure, as a UFL expression."""
+    """Return (logarithmic mean of the densities at two pressures) / (density at zero pressure), as a UFL expression."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the mean densities (n,) of `density_between` for arrays of pressures (n,), Pa.  `bulk` is K_w, Pa."""
+    """Return the result of `density_between` (n,) for arrays of pressures (n,), Pa.  `bulk` is K_w, Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

@@ -55,10 +55,10 @@ class _Columns:
 
 
 class Rows(Sequence[Row]):
-    """Immutable sequence of the quantities at all output times of a run, a `Row` each.
+    """Immutable sequence of the quantities at all output times of a run: one `Row` for each output time.
 
-    An extended object shares its arrays with the previous one, so the time to append a row does not grow with the run.
-    Rows of different length, as in stages with different conditions, are padded with nan.
+    The result of `more` shares its arrays with this object, so the time to append a row does not grow with the run.
+    If a quantity has different shapes in two rows, the smaller array is padded with nan.
 
     Attributes
     ----------

@@ -60,7 +60,7 @@ def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
 
 
 def _axes(dim: int, size: int) -> list[str]:
-    """Return the suffixes of the components of a force, and of the moments if `size` includes them."""
+    """Return the suffixes of the components of a force and, if `size` > `dim`, of its moments."""
     axes = ["_x", "_y", "_z"][:dim]
     return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 

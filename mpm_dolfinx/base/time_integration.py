@@ -8,10 +8,10 @@ zeta' + Q(u, p) = 0 with the net outflow Q.  With the subscript n at the start o
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
-With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method needs no rate at
-the start of the step, which the transfer between grids would make noisy.  (u2, p2) is the end of the step.  After a
-jump of the loads, one long step overshoots by a fifth, but two steps of half the length do not, see `step_size`.  The
-error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
+With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method does not use the
+rate at the start of the step, which is noisy after a transfer between grids.  (u2, p2) are the values at the end of the
+step.  After a jump of the loads, one long step overshoots by a fifth, but two steps of half the length do not, see
+`step_size`.  The error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement in the first substep that gives a prescribed motion its exact velocity.
+    """Return the displacement to prescribe at the end of the first substep, so that the velocity there is exact.
 
-    With share = gamma, the method implies u = share dt v in the first substep; both substeps give the velocity at the
-    end of the step.  If u is prescribed in both substeps, velocities are first-order accurate and accelerations do not
-    converge.  This function takes v from the parabola through the three displacements.
+    The method computes this velocity v from the increment of displacement, which equals share dt v.  With the exact
+    displacement, v is first-order accurate, and accelerations do not converge.  This function takes v from the parabola
+    through three displacements, and returns start + share dt v.
 
     `share` is the end of the substep as a fraction of the step.  The displacements are `start` at the
     start of the step, `now` at the end of the substep and `end` at the end of the step.
@@ -58,7 +58,7 @@ EULER = METHODS["backward-euler"]
 
 
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:
-    """Return the substeps of a method.  A scene without time derivatives has one substep."""
+    """Return the substeps of a method; one substep if the scene has no time derivatives (`evolves` is False)."""
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method {method!r}: must be one of {', '.join(METHODS)}")
     return METHODS[method if evolves else "backward-euler"]

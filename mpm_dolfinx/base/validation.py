@@ -12,8 +12,8 @@ X : (m, d), m
 x : (m, d), m
     Positions of the same places at the start of the step, for example to prescribe a water level.
 
-If a function has only one parameter, and its name is not in this list, it receives the time.  With several parameters,
-other names raise an error.  Parameters with default values keep these.  Material constants are functions of X.  Initial
+A single parameter with another name receives the time.  With several parameters, other names raise an error.
+Parameters keep their default values, unless all parameters have one.  Material constants are functions of X.  Initial
 pressures and stresses are functions of x, the seeded positions.
 
 A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
@@ -115,7 +115,7 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
         raise ValueError(f"{name} = {line(values)}, must be a list of {what}")
     for i, value in enumerate(values):
         if not isinstance(value, (int, np.integer)) or value not in among or value in values[:i]:
-            options = ", ".join(map(str, among)) or "none is"
+            options = ", ".join(map(str, among)) or "there is none"
             raise ValueError(f"{name}: body {line(value)}, must be one of the {what}, each once: {options}")
 
 
@@ -169,7 +169,7 @@ Places = Callable[[str], NDArray[np.float64]]
 PLACES = ("X", "x")
 NAMES = ("t", *PLACES)
 PLAIN = (FunctionType, MethodType)
-LIBRARIES = ("numpy", "scipy")  # their functions call any argument x
+LIBRARIES = ("numpy", "scipy")  # in their functions, an argument named x need not be a position
 
 
 def _plain(function: Callable) -> bool:
@@ -218,7 +218,7 @@ def by_place(value) -> bool:
     return callable(value) and bool(set(PLACES) & set(takes(value) or ()))
 
 
-def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> tuple[str, ...]:
+def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[str, ...]:
     """Return the arguments of a function, among t, X and x.
 
     Raises
@@ -234,7 +234,7 @@ def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> 
         raise ValueError(f"{what}: an object or a library's function of x, must be lambda t: ..., or lambda x: ...")
     allowed = "must be a function of the time alone"
     if len(among) > 1:
-        allowed = f"must be a function of {', '.join(among[:-1])} or {among[-1]}, so named, or of the time alone"
+        allowed += f", or of parameters named {', '.join(among[:-1])} or {among[-1]}"
     raise ValueError(f"{what}: a function of ({given}), {allowed}")
 
 
@@ -250,7 +250,7 @@ def called(function: Callable, values: dict) -> object:
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
-    """Return the value of a function of positions, whose single parameter must be called `name`, "X" or "x".
+    """Return the value of a function of positions.  Its only parameter must be called "X" or "x", as given by `name`.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def given(
     among
         Allowed parameter names, among t, X and x.
     number
-        Whether a scalar is allowed too.
+        Whether a scalar is allowed if `dim` > 0.
 
     Raises
     ------

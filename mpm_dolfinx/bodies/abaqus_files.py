@@ -45,7 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements.  Each entry has the name of an instance, or "", and element numbers or another set's name."""
+    """A set of elements.  An entry is a pair: name of an instance or "", and element numbers or name of another set."""
 
     name: str
     internal: bool
@@ -61,7 +61,7 @@ class _Scope:
     # cell type, element numbers (m,), node numbers (m, k)
     cells: list[tuple[str, NDArray[np.int64], NDArray[np.int64]]] = field(default_factory=list)
     sets: dict[str, _Set] = field(default_factory=dict)
-    # name, and pairs of a set or element with a face
+    # name, and pairs (set or element, face)
     surfaces: dict[str, tuple[str, list[tuple[str, str]]]] = field(default_factory=dict)
 
     def entry(self, options: Mapping[str, str], instance: str, rows: NDArray[np.int64] | str) -> None:
@@ -157,7 +157,7 @@ def _placed(file: Path) -> list[_Placed]:
             shift, turn = ([float(v) for v in row.split(",") if v.strip()] for row in (*rows, "", "")[:2])
             if len(shift) > 3 or len(turn) not in (0, 7):
                 what = f"*INSTANCE {options['NAME']}: {len(shift)} and {len(turn)} numbers"
-                raise ValueError(f"{what}, must be 3 of a translation and 7 of a rotation")
+                raise ValueError(f"{what}, must be up to 3 of a translation, and 7 of a rotation or none")
             instances.append(_Placed(scope, options["NAME"], np.array((*shift, 0.0, 0.0, 0.0)[:3]), tuple(turn)))
         elif keyword in ("END PART", "END INSTANCE"):
             scope = whole

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
-from mpm_dolfinx.grid.grid import SIDES, Grid, in_chunks
+from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, corner_bits, in_chunks
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, domain_volumes, volumes
+from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -21,9 +21,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class Body:
     """A seeded body: reference geometry of all its particle domains, the same on every process.
 
-    Each domain is the image of a box under `map`, see `mapped`.  Subclasses define `spacing`, the edges of boxes, m:
-    (d,) for boxes of equal size, (n, d) in general, or (d,) with the smallest edges.  Arrays over all domains are not
-    stored, so that large bodies can be processed in chunks.
+    Each domain is the image of a box under `map`, see `mapped`.  Subclasses define `spacing`, m: the edge lengths of
+    the boxes (n, d), or (d,) if all boxes are equal; in a `RowsBody`, the smallest edge lengths (d,).  Arrays over all
+    domains are not stored, so that large bodies can be processed in chunks.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -85,11 +85,11 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on the side `name`, in ascending order, and their face numbers (m,)."""
+        """Return the domains (m,) with a face on the side `name`, in ascending order, and the face indices (m,)."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face numbers.
+        """Return the domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face indices.
 
         In unstructured bodies, these are the surface faces whose outward unit normal has its largest component along
         this direction, if this component exceeds `least`.
@@ -103,11 +103,11 @@ class Body:
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains along an axis, and their mean edge length, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) and face numbers (m,) of all surface faces, sorted by face number."""
+        """Return the domains (m,) and face indices (m,) of all surface faces, sorted by face index."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
@@ -126,13 +126,13 @@ class Body:
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
-            raise ValueError(f"body: the map returns shape {images.shape}, must be one position each, {x.shape}")
+            raise ValueError(f"body: the map returns shape {images.shape}, must be {x.shape}, as the given positions")
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the largest distances (m,), m, from edge midpoints of domains to mapped edge midpoints of their boxes.
+        """Return for each chosen domain (m,) how far, m, its straight edges deviate from the mapped edges of its box.
 
-        Straight edges of two domains along the same curve may differ by this distance.
+        This is the largest distance of midpoints.  Edges of two domains on the same curve may differ by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:
@@ -151,11 +151,11 @@ class Body:
 
     @property
     def volume_of_boxes(self) -> float:
-        """Volume of all boxes, m^d, for boxes of equal size."""
+        """Total volume of all boxes, m^d, if these are equal."""
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), m, of boxes that have the volumes of the domains."""
+        """Return the edge lengths (m, d), m, of the boxes, scaled uniformly to the volumes of the chosen domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -184,7 +184,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
         The map raises an exception, returns another shape or nan, leads out of the grid, or inverts a box.
     """
     instance("body: grid", grid, Grid)
-    instance("body to bend", body, Body)
+    instance("body to map", body, Body)
     inner = body.map
     bent = replace(body, map=map if inner is None else lambda x: map(np.asarray(inner(x), dtype=float)))
     smallest, where = np.inf, None

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import asked, instance, numbers, whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
-from mpm_dolfinx.grid.grid import MOST, Grid, among, in_chunks
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.grid.grid import MOST, Grid, among, corner_bits, in_chunks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,7 +24,7 @@ class LatticeBody(Body):
     origin: NDArray[np.float64]  # lower corner of the lattice (d,), m
     spacing: NDArray[np.float64]  # edge lengths of the boxes (d,), m
     count: tuple[int, ...]  # number of boxes along each axis
-    filled: NDArray[np.integer] | None = None  # lexicographic numbers of the body's boxes (n,), ascending; None: all
+    filled: NDArray[np.integer] | None = None  # lexicographic indices of the body's boxes (n,), ascending; None: all
 
     def __len__(self) -> int:
         return int(np.prod(self.count)) if self.filled is None else len(self.filled)
@@ -91,14 +90,14 @@ class LatticeBody(Body):
         return tuple(high - low + 1)
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return node numbers (m, 2^d) of the corners of domains, equal for shared corners, in lexicographic order."""
+        """Return the lexicographic node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
         corners = (self._index(rows) - self._ends[0])[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths; `spacing` (d,), m, is the width of the narrowest."""
+    """A body of boxes on a lattice with rows of different widths; `spacing` (d,), m, are the smallest widths."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
 
@@ -124,7 +123,7 @@ class RowsBody(LatticeBody):
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains along an axis, and their mean edge length, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
@@ -136,7 +135,7 @@ class RowsBody(LatticeBody):
 
     @property
     def volume_of_boxes(self) -> float:
-        """Volume of all boxes, m^d."""
+        """Total volume of all boxes, m^d."""
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
@@ -173,7 +172,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  If it is 1, thin bodies are too flexible (with a warning), and errors are ten times as large as with 2.
+        lines.  With 1 point, thin bodies are too flexible (with a warning); errors are ten times as large as with 2.
     material
         Index of the material in the scene's list, >= 0.
 

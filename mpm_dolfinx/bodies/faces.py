@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.tolerances import SAME, TINY
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import (
     BITS,
@@ -26,8 +27,7 @@ from mpm_dolfinx.bodies.touching import (
     weights,
     within,
 )
-from mpm_dolfinx.grid.grid import rounding
-from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACES, corner_bits
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACES, corner_bits, ranges, rounding
 
 TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(d)]) for d in (2, 3)}
 """Tangential axes (d, d-1) of the faces normal to each axis."""
@@ -41,8 +41,8 @@ class Surface:
     each polygon has a row.
     """
 
-    id: NDArray[np.int64]  # number of the material point (m,), ascending
-    face: NDArray[np.int64]  # number of the face in its domain (m,), see `cutting.FACES`
+    id: NDArray[np.int64]  # identifier of the material point (m,), ascending
+    face: NDArray[np.int64]  # index of the face in its domain (m,), see `grid.FACES`
     # corners of the free part in local coordinates of the domain in [-1, 1] (m, 2^(d-1), d); triangles repeat the last
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
@@ -104,6 +104,20 @@ class Surface:
     def X(self) -> NDArray[np.float64]:
         """Bounding boxes (m, 2, d), m, of the reference positions of the free parts."""
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
+
+    def check_apart(self, others: Surface, conditions: tuple[Any, Any]) -> None:
+        """Raise an error if two conditions that exclude each other act on the same part of a face."""
+        first, stop = (np.searchsorted(others.id, self.id, end) for end in ("left", "right"))
+        a, b = ranges(first, stop - first)  # all pairs of faces of the same domain
+        same = self.face[a] == others.face[b]
+        a, b = a[same], b[same]
+        low, high = np.maximum(self.X[a, 0], others.X[b, 0]), np.minimum(self.X[a, 1], others.X[b, 1])
+        size = self.X[a, 1] - self.X[a, 0]
+        common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # or no extent along it
+        both = np.flatnonzero(common.all(axis=1))
+        if len(both):
+            x = (low[both[0]] + high[both[0]]) / 2
+            raise ValueError(f"{' and '.join(map(line, conditions))}: both act at {x}, must not; limit them by regions")
 
 
 Region = tuple[ArrayLike, ArrayLike]
@@ -180,7 +194,7 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # a sliver in the region would prescribe a domain
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # so that no sliver in the region prescribes a face
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)
@@ -195,9 +209,9 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Limit parts of faces to a region; return the face (m,) of each limited part, and its corners xi as in `Surface`.
+    """Limit parts of faces to a region; return for each limited part its face (m,), and corners xi as in `Surface`.
 
-    `row` and `face` (k,) are domains and face numbers.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
+    `row` and `face` (k,) are domains and face indices.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
@@ -248,7 +262,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region; return triangles, and the index of the part of each."""
+    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region; return triangles, and for each the index of its part."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, a corner serves as the middle
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -264,7 +278,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces: the face (n,) of each part, and its corners (n, 4, 2) in face coordinates [0, 1].
+    """Return the free parts of faces: for each part its face (n,) and corners (n, 4, 2) in face coordinates [0, 1].
 
     A part is a rectangle if all boxes that cover its face lie along the edges of the face.  Otherwise it is a triangle
     with a repeated last corner.
@@ -293,7 +307,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return local coordinates xi (n, 3) in domains (n, 8, 3), moved along faces (n,) to match positions x (n, 3)."""
+    """Return local coordinates xi (n, 3), with the tangential parts of positions x (n, 3) projected onto faces (n,)."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

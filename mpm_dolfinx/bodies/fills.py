@@ -16,15 +16,15 @@ from scipy.sparse import coo_array, csr_array, diags
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
-from mpm_dolfinx.grid.grid import REACH, Grid
+from mpm_dolfinx.grid.grid import FACES, REACH, Grid
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
+from mpm_dolfinx.points.cutting import TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-MISFIT = 0.01  # cells: a fill's straight edges may be this far from a bent surface before a warning is given
-UPRIGHT = 0.95  # cosine of the largest angle between mesh faces and the side opposite to the contact
-INSIDE = 0.05  # of a domain's shortest edge: deeper penetration into a fill is an error
+MISFIT = 0.01  # largest (distance of a fill's straight edges from a bent surface) / cell size without a warning
+UPRIGHT = 0.95  # cosine of the largest angle between an axis and normals of mesh faces on the side opposite a contact
+INSIDE = 0.05  # fraction of a domain's shortest edge; deeper penetration into a fill is an error
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill lie on the paired faces, and displacements of these (n, 4, d), m."""
+        """Return which corners (n, 4) of the fill lie on paired faces, and there the body's displacement (n, 4, d)."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
@@ -96,7 +96,7 @@ def put(
     if any(contact.moved.any() for contact in contacts):
         u = _follow(grid, body, corners, contacts)
         misfit = max(contact.misfit(u) for contact in contacts)
-        _check_shape(grid, fill, body, corners, u)
+        _check_shape(grid, fill, corners, u)
         corners = corners + u
     if misfit > MISFIT * grid.least:
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface on which it is placed"
@@ -117,7 +117,7 @@ def put(
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:
-    """Return the number of the first material point of a body."""
+    """Return the identifier of the first material point of a body."""
     return sum(len(b) for b in bodies[:body])
 
 
@@ -200,7 +200,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
     return out
 
 
-def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray) -> None:
+def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
     """Raise an error if a displaced domain of the fill loses nearly all its volume, or leaves the grid."""
     now = corners + u
     ratio = volumes(now) / volumes(corners)
@@ -215,13 +215,13 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):
         x = now.reshape(-1, grid.dim)[out[0]] + grid.base
-        raise ValueError(f"{name}; a corner that follows reaches {x}, must be inside {grid.lower} to {grid.upper}")
+        raise ValueError(f"{name}; a corner of the fill moves to {x}, must be inside {grid.lower} to {grid.upper}")
 
 
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the penetration depth of a body into the fill's domains, m, the gap in cells, and the position (d,), m.
+    """Return the depth, m, to which a body penetrates the fill, the gap / cell size, and the position (d,), m.
 
     Depth, gap or both are zero.
     """

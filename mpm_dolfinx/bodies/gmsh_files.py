@@ -53,7 +53,7 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1.  Cell sets are physical groups by number; field data are their names."""
+    """Return the mesh of a file of format 4.1.  Cell sets are physical groups by tag; field data have their names."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"
@@ -92,7 +92,7 @@ def _section(data: bytes, name: str) -> bytes:
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return the (number, dimension) pairs (k, 2) of the physical groups by name."""
+    """Return the pairs (tag, dimension) (k, 2) of the physical groups with each name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -102,7 +102,7 @@ def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
 
 
 def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
-    """Yield (dimension, number) of each entity, and the numbers of its physical groups."""
+    """Yield (dimension, tag) of each entity, and the tags of its physical groups."""
     for dim, count in enumerate(numbers.take(4, "u")):
         for _ in range(count):
             (tag,) = numbers.take(1)
@@ -115,7 +115,7 @@ def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
 
 
 def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the numbers (n,) and positions (n, 3), m, of the nodes."""
+    """Return the tags (n,) and positions (n, 3), m, of the nodes."""
     tags, x = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for _ in range(numbers.take(4, "u")[0]):
         dim, _, parametric = numbers.take(3)
@@ -127,7 +127,7 @@ def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int64]]]:
-    """Yield the dimension and number of each entity, and the cell type and nodes (n, k) of its elements."""
+    """Yield the dimension and tag of each entity, and the cell type and nodes (n, k) of its elements."""
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:

@@ -2,7 +2,7 @@
 """Cell types of meshes: their facets, and their division into particle domains.
 
 A triangle is divided into three quadrilaterals, a tetrahedron into four hexahedra with plane faces: one domain for each
-vertex.  Each corner of this domain is the mean of the vertex and none, some or all of the others.  A wedge is divided
+vertex.  Each corner of a domain is the mean of its vertex and of none, some or all other vertices.  A wedge is divided
 like its triangle; a pyramid consists of two tetrahedra.  Neighbouring cells divide their common facet in the same way.
 The exception is a quadrilateral facet of a hexahedron, which is not divided.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.points.cutting import FACES, corner_bits
+from mpm_dolfinx.grid.grid import FACES, corner_bits
 
 KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
 """Types of cells that become particle domains, and their numbers of vertices."""
@@ -49,15 +49,15 @@ class Block(NamedTuple):
 
 
 def edges(kind: str) -> list[tuple[int, int]]:
-    """Return the pairs of vertices of the edges of a cell type, numbered as in `LOOPS`, without repetition."""
+    """Return both vertices of each edge of a cell type, with indices as in `LOOPS`; each edge occurs once."""
     around = [pair for loop in LOOPS[kind] for pair in zip(loop, (*loop[1:], loop[0]), strict=True)]
     return sorted({tuple(sorted(pair)) for pair in around})
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index of each distinct row of an array (n, k), and for each row its index (n,) among these.
+    """Return the first index in each group of equal rows of an array (n, k), and the group (n,) of each row.
 
-    Distinct rows are sorted.  `np.unique` compares rows as objects and takes five times as long.
+    Groups are sorted by row.  `np.unique` compares rows as objects and takes five times as long.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
@@ -122,11 +122,11 @@ class Polytopes:
     x: NDArray[np.float64]  # vertices (n, k, d), m, padded by repeating the last one
     normals: NDArray[np.float64]  # normals of facets (n, f, d), padded by zeros
     edges: NDArray[np.float64]  # edge vectors (n, e, d), m, padded by zeros
-    warp: NDArray[np.float64]  # distance of facet vertices from the mean plane of the facet (n,), m
+    warp: NDArray[np.float64]  # largest distance of facet vertices from the mean plane of their facet (n,), m
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return all cells as polytopes, from positions x (nodes, d), m, and the nodes (n, k) of each cell type."""
+        """Return all cells as polytopes, from positions x (nodes, d), m, and the nodes (n, k) of cells of each type."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
@@ -137,8 +137,8 @@ class Polytopes:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the indices (k,) of the pairs of cells i, j (m,) that overlap, and the depths (k,), m, of overlap.
 
-        Two convex cells overlap if no plane separates them.  It is sufficient to try planes normal to the facet normals
-        and, in 3D, to the cross products of edges.  An overlap shallower than `slack` (m,), m, is ignored.
+        Two convex cells overlap if no plane separates them.  It is sufficient to try planes parallel to a facet or, in
+        3D, to an edge of each cell.  An overlap shallower than `slack` (m,), m, is ignored.
         """
         left, depth = np.arange(len(i)), np.full(len(i), np.inf)
         for normals in self._planes():

@@ -23,14 +23,13 @@ from mpm_dolfinx.base.validation import instance, line, line_of, path
 from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded, warn_small
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import FACES, Grid
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
 TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_markers", "CellEntityIds")
-"""Names under which meshio stores the numbers of parts and sides in cell data."""
+"""Names of the cell data in which meshio stores the tags of parts and sides."""
 OF_DOLFINX = {2: {"triangle": 6, "quad": 9}, 3: {"tetra": 10, "hexahedron": 27}}
 """Cell types of dolfinx that become particle domains, and their numbers of nodes at second order."""
 
@@ -49,9 +48,9 @@ def from_mesh(
     """Seed a body from a mesh whose cells become particle domains; return the body.
 
     Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
-    surfaces, or facet tags.  Bodies from several parts of a mesh share the faces between the parts, which are no
-    surface while both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice, so
-    the filter of short waves does not act.
+    surfaces, or facet tags.  Bodies from several parts of a mesh share the faces between the parts.  Shared faces are
+    no surface while both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice,
+    so the filter of short waves does not act.
 
     Parameters
     ----------
@@ -62,12 +61,12 @@ def from_mesh(
         2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
         warning that gives the distance of edge nodes from straight edges.  2D cells must lie in a plane of equal z.
     part
-        Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a number in data
-        such as "MaterialIDs".
+        Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a tag in data such
+        as "MaterialIDs".
     cell_tags, facet_tags
-        Tags of a dolfinx mesh.  For a file, `cell_tags` is the name of the cell data that number parts and sides.
+        Tags of a dolfinx mesh.  For a file, `cell_tags` is the name of the cell data with the tags of parts and sides.
     names
-        Number of the tag for each name.  A tag without a name is named by its number, such as "3".
+        Tag that each name stands for.  A tag without a name is named by its digits, such as "3".
     per_cell
         Desired points per grid cell and direction, >= 1.  Domains with an edge above 1.5 cells / per_cell are divided.
     material
@@ -110,7 +109,7 @@ def _file(file: Path) -> meshio.Mesh:
 
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Convert a meshio mesh.  `tags` is the name of the cell data that number parts and sides."""
+    """Convert a meshio mesh.  `tags` is the name of the cell data with the tags of parts and sides."""
     mesh_readers.check_systems(mesh)
     dim = grid.dim
     x = _positions(grid.dim, mesh.points)
@@ -175,7 +174,7 @@ def _vertices(dim: int, kind: str) -> int:
 
 
 def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
-    """Raise an error for cells with node numbers that do not exist."""
+    """Raise an error for cells with nodes that do not exist."""
     if rows.size and not (rows.min() >= 0 and rows.max() < count):
         worst = rows.min() if rows.min() < 0 else rows.max()
         raise ValueError(f"mesh: a cell has node {worst}, must be one of the {count} nodes, counted from 0")
@@ -256,7 +255,7 @@ def _groups(
 
 
 def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
-    """Yield gmsh's physical groups as (name, (number, dimension)); several groups may have the same name."""
+    """Yield gmsh's physical groups as (name, (tag, dimension)); several groups may have the same name."""
     for name, value in field_data.items():
         if np.shape(value)[-1:] == (2,):
             for pair in np.reshape(value, (-1, 2)):
@@ -264,17 +263,17 @@ def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
 
 
 def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
-    """Return the user's tag numbers by name; empty if none were given."""
+    """Return the user's tags by name; empty if there are none."""
     whole = (int, np.integer)
     if names is not None and not (
         isinstance(names, Mapping) and all(isinstance(k, str) and isinstance(v, whole) for k, v in names.items())
     ):
-        raise ValueError(f"mesh: names = {line(names)}, must be numbers of tags by name, such as {{'top': 3}}")
+        raise ValueError(f"mesh: names = {line(names)}, must be integer tags by name, such as {{'top': 3}}")
     return names or {}
 
 
 def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield each name and which of the tags (n,) have it.  Numbers without a name are named by their digits."""
+    """Yield each name, and which entries of `tags` (n,) have this name.  Tags without a name are named by digits."""
     for name, number in names.items():
         if (tags == number).any():
             yield name, tags == number
@@ -284,14 +283,14 @@ def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tupl
 
 
 def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int64]]) -> NDArray[np.float64]:
-    """Return the first `dim` coordinates of vertices (nodes, 2 or 3).  In 2D, cells outside one plane are an error."""
+    """Return the first `dim` coordinates of vertices (nodes, 2 or 3).  In 2D, all cells must have the same z."""
     used = np.unique(np.concatenate([np.empty(0, np.int64), *(rows.ravel() for rows in cells.values())]))
     if not np.isfinite(x[used]).all():
         invalid = used[~np.isfinite(x[used]).all(axis=1)][0]
         raise ValueError(f"mesh: vertex {invalid} is at {x[invalid]}, must be at finite coordinates")
     if len(used) and x.shape[1] > dim and np.ptp(x[used, 2]) > NEAR * np.ptp(x[used, :2], axis=0).max():
         low, high = x[used, 2].min(), x[used, 2].max()
-        raise ValueError(f"mesh: a surface in space, z from {low:.3g} to {high:.3g}, must be flat in 2D, in x and y")
+        raise ValueError(f"mesh: a surface in space, z from {low:.3g} to {high:.3g}, must be flat in 2D, with equal z")
     return x[:, :dim]
 
 

@@ -22,9 +22,9 @@ from mpm_dolfinx.base.validation import whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.bodies.touching import Faces, covers, face_vectors
-from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
+from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
 LONG = 1.5  # cells / per_cell: domains with longer edges are divided
 SMALL = 0.2  # of the desired domain size: smaller domains cause a warning
@@ -99,13 +99,13 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on the side `name`, in ascending order, and their face numbers (m,)."""
+        """Return the domains (m,) with a face on the side `name`, in ascending order, and the face indices (m,)."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face in a direction, and the face numbers; see `Body.facing`."""
+        """Return the domains (m,) with a surface face in a direction, and the face indices; see `Body.facing`."""
         row, face = self.outer()
         outward = face_vectors(self.corners(row), face)
         along = np.abs(outward).argmax(axis=1) == axis
@@ -113,7 +113,7 @@ class MeshBody(Body):
         return row[along], face[along]
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains along an axis, and their mean edge length, m."""
+        """Return, along an axis, (extent of the body) / (mean edge length of domains), and this mean, m."""
         edge = float(self.spacing[:, axis].mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
@@ -122,7 +122,7 @@ class MeshBody(Body):
         return self.vertices[chosen]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return node numbers (m, 2^d) of the corners of domains, equal for shared corners."""
+        """Return node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
         return self._nodes[rows]
 
     @cached_property
@@ -167,7 +167,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facet that contains each face, and their cells.
+    """Return domains (n, 2^d, d), nodes (n, 2d, 2^(d-1)) of the facet containing each face, and cells of the domains.
 
     Nodes of a facet ascend; a -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
     """
@@ -206,7 +206,7 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error for cells on the same side of a common facet, found from the sum of their outward vectors.
+    """Raise an error if both cells of a facet lie on one side of it, so that their outward vectors do not cancel.
 
     `facet` is the facet of each face of `domains`; `shared` (m,) tells which facets belong to two cells.
     """
@@ -234,16 +234,8 @@ def _check_overlaps(
     Each facet inside the mesh has a cell on both sides.  The number of cells at a position therefore changes only
     across the surface, and an overlap involves a cell with a facet on the surface.
 
-    Parameters
-    ----------
-    x : (nodes, d), m
-        Positions of the nodes.
-    cells
-        Nodes of the cells by cell type.
-    outer : (m,)
-        Indices of the cells with a facet on the surface.
-    neighbours : (n, 2)
-        Pairs of cells that share a facet.
+    x (nodes, d): positions, m; cells: nodes of the cells by cell type; outer (m,): cells with a facet on the surface;
+    neighbours (n, 2): pairs of cells that share a facet.
     """
     corners = [x[nodes] for nodes in cells.values()]
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
@@ -270,9 +262,9 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs (n,), (n,) of a surface cell and any other cell whose bounding boxes (m, 2, d) overlap.
+    """Return surface cells (n,), and for each of them another cell (n,) whose bounding box (m, 2, d) overlaps its own.
 
-    Boxes are grouped by size, in octaves.  Otherwise the search radius of a large box would include all small ones.
+    Boxes are grouped by size, in octaves.  Otherwise small boxes would be searched with the radius of the largest box.
     """
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
@@ -348,7 +340,7 @@ def _split(
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
     if grid.even:
         longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
-    else:  # edges are measured in cells
+    else:  # edges are divided by the cell size
         y = grid.in_cells(domains - grid.base)
         edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
         longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)

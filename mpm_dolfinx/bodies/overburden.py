@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
 
 
 def overburden(
@@ -22,7 +22,7 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
 
-    Both are means over lines on all sides of a position, because a border of domains may lie above the position.
+    Both are means over vertical lines close to a position, on all sides, because borders of domains may lie above it.
 
     Parameters
     ----------

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
+from mpm_dolfinx.points.cutting import cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
 
@@ -28,17 +28,18 @@ class Faces:
     """Faces of a body after its map; arrays over m faces."""
 
     row: NDArray[np.int64]  # domain of the face (m,)
-    index: NDArray[np.int64]  # numbers of the face's corners in the domain (m, 4)
+    index: NDArray[np.int64]  # indices of the face's corners in the domain (m, 4)
     corners: NDArray[np.float64]  # positions of the corners (m, 4, 3), m
     outward: NDArray[np.float64]  # outward area vector (m, 3), m^2
     bend: NDArray[np.float64]  # distance of straight edges from the mapped ones (m,), m, see `Body.bend`
 
     @classmethod
     def of(cls, body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> Faces:
-        """Return the faces of a body with domains `row` (m,) and face numbers `face` (m,)."""
+        """Return the faces of a body with domains `row` (m,) and face indices `face` (m,)."""
         domains, dim = body.corners(row), body.dim
         outward = np.pad(face_vectors(domains, face), ((0, 0), (0, 3 - dim)))
-        index = face_index(dim)[face]
+        # in plane strain each corner occurs at both ends of axis 3
+        index = FACES[dim][face] if dim == 3 else FACES[dim][face][:, BITS[:, 0]]
         corners = np.take_along_axis(domains, index[:, :, None], axis=1)
         if dim == 2:
             corners = np.concatenate([corners, np.broadcast_to(BITS[:, 1:], (len(row), 4, 1))], axis=2)
@@ -50,7 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the lengths (m, 2), m, of the shorter edge of each face along the first and the second face axis."""
+        """Return the length (m, 2), m, of the shorter of two opposite edges of each face, for both face axes."""
         c = self.corners
         along = [np.linalg.norm([c[:, 1] - c[:, 0], c[:, 3] - c[:, 2]], axis=2)]
         along += [np.linalg.norm([c[:, 2] - c[:, 0], c[:, 3] - c[:, 1]], axis=2)]
@@ -81,7 +82,7 @@ class Cover:
 def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
     """Return the outward area vectors (m, d), m^(d-1), of one face of each domain (m, 2^d, d).
 
-    `face` is the number of the face, (m,) or the same for all domains.
+    `face` is the index of the face, (m,) or the same for all domains.
     """
     dim = corners.shape[2]
     x = corners[np.arange(len(corners))[:, None], FACES[dim][face]]
@@ -90,16 +91,7 @@ def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) ->
         n = np.array([t[:, 1], -t[:, 0]]).T
     else:
         n = 0.5 * np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1])
-    return n * _OUTWARD[dim][face].reshape(-1, 1)
-
-
-_OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
-"""Sign that turns the cross product of a face's edges outwards."""
-
-
-def face_index(dim: int) -> NDArray[np.int64]:
-    """Return the corners (2d, 4) of a domain's faces.  In plane strain each corner occurs at both ends of axis 3."""
-    return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
+    return n * np.array(FACE_SIGNS)[face].reshape(-1, 1)
 
 
 def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,7 +100,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose bounding boxes are within a distance."""
+    """Return index pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose boxes may lie within a distance."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -196,7 +188,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces (m,) as triangles: the face (n,) of each, and its corners (n, 3, 2) in [0, 1]."""
+    """Return the free parts of faces (m,) as triangles: for each its face (n,) and corners (n, 3, 2) in [0, 1]."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -275,7 +267,7 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rectangles of faces that no box covers: the face (m,) of each, and lower and upper corners (m, 2).
+    """Return the rectangles of faces that no box covers: for each its face (m,), lower and upper corner (m, 2).
 
     Parameters
     ----------
@@ -344,7 +336,7 @@ def uncovered(
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gaps (n,), m, between convex domains a and b (n, 2^d, d), m; a negative gap is the depth of overlap.
 
-    Domains do not overlap if a plane separates them that is parallel to a face or, in 3D, to an edge of each domain.
+    Domains overlap unless a plane separates them.  It can be parallel to a face or, in 3D, to an edge of each domain.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
@@ -396,10 +388,10 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of domains, m, their smallest gap in cells, and the position (d,), m.
+    """Return the largest overlap of domains, m, their smallest (gap / cell size), and the position (d,), m.
 
-    `a` and `b` are domains and tolerances, see `solids`.  `in_cells` converts positions to cells.  Touching domains
-    have overlap 0 and gap 0; the gap of distant domains is inf.
+    `a` and `b` are domains and tolerances, see `solids`.  `in_cells` divides positions by the cell size.  Touching
+    domains have overlap 0 and gap 0; the gap of distant domains is inf.
     """
     i, j = near(a[0], b[0])
     separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
@@ -423,7 +415,7 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
     """Raise an error for seeded bodies that overlap.  Warn about separate bodies that share nodes and will stick."""
     indices = [i for i in range(len(bodies)) if present[i]]
     found = {i: solids(bodies[i]) for i in indices} if len(indices) > 1 else {}
-    first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
+    first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # first point of each body
     for i, j in combinations(indices, 2):
         depth, gap, x = meeting(found[i], found[j], lambda x: grid.in_cells(x - grid.base))
         if depth:

@@ -3,16 +3,17 @@
 
 The method `acting(setting)` of a condition returns an `Acting`.  See `flow/feeding.py` for conditions on the fluid.
 
-A condition acts through objects of three levels.  `Acting` is created once in a stage and holds the loaded faces.
+A condition acts on three levels: stage, substep, assembly.  `Acting` is created once in a stage and holds loaded faces.
 `Acting.placed` returns the `Loads` of a substep at the current position of the faces.  At each assembly `Loads` add
-forces to the residual and stiffness to the tangent.  The code of the step and of the momentum balance calls this
-interface only; it names no particular condition.
+forces to the residual and stiffness to the tangent.  The code of the step and of the momentum balance calls only this
+interface, and names no particular condition.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from petsc4py import PETSc
@@ -22,6 +23,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.conditions import Displacement
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.unknowns import Unknowns
@@ -34,7 +36,7 @@ from mpm_dolfinx.points.parts import Parts
 T = TypeVar("T")
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
-"""Reactions, outflows and other results of the conditions: quantity, such as "reactions" -> condition -> values."""
+"""Reactions, outflows and other results of the conditions: quantity (such as "reactions") -> condition -> values."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Quantities that the conditions of the package return."""
 OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
@@ -88,6 +90,13 @@ class Setting:
         """Background grid."""
         return self.sides.grid
 
+    @cached_property
+    def held(self) -> list[tuple[Displacement, Surface, Sequence[int]]]:
+        """Prescribed displacements of the stage, with the faces and the axes on which they are imposed."""
+        holds = [(hold, hold.axes(self.grid.dim)) for hold in self.of(Displacement).values()]
+        rest = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
+        return [(hold, self.sides.held(hold, those), axes) for (hold, axes), those in zip(holds, rest, strict=True)]
+
     def of(self, *kinds: type) -> dict[str, Any]:
         """Return the conditions of the given classes, by name."""
         return {name: one for name, one in self.conditions.items() if isinstance(one, kinds)}
@@ -116,10 +125,11 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Displacement increment u of the step (a local array), m, and the numbering of the unknowns."""
+    """Displacement increment u of the step (a local array), m, the numbering of unknowns, and connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
+    parts: Parts | None = None
 
     @property
     def nodal(self) -> NDArray[np.float64]:
@@ -158,7 +168,7 @@ class Loads:
         """With inertia, return the data of this converged substep that the next substep needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers at u on this process, W: dissipation by slip, and any power that `push` does not show.
+        """Return two powers at u on this process, W: dissipation by slip, and a power to add to that of `push`.
 
         `v` are nodal velocities, a local array, m/s.
         """
@@ -190,7 +200,7 @@ class Loads:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual of unknowns or fixed components.  Its scale does not include them."""
+        """Subtract forces at u from the residual of unknowns or fixed components.  The residual's scale omits them."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
         """Return the inertia forces at u, N, or None.  They enter the residual and its scale."""
@@ -206,7 +216,7 @@ class Loads:
         return False
 
     def augment(self, at: At) -> bool:
-        """Once equilibrium is reached, update the multipliers; return whether forces changed."""
+        """When equilibrium is reached, update the multipliers; return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:
@@ -217,11 +227,11 @@ class Loads:
         """Return an initial guess of the displacements (nodes, d), m, or None."""
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return loads that include the reactions of prescribed sides to a displacement u, m, in the initial state."""
+        """Return the loads in the initial state, with the penalty forces that a displacement u, m, causes."""
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled local dofs (n,) on walls, and forces (n,), N, on these that are not reactions of walls."""
+        """Return unrolled local dofs (n,) on walls, and the forces on them (n,), N, that are not reactions of walls."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -240,7 +250,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), N, of forces in local cells; `of_cells` are those without this condition."""
+        """Return rounding errors (cells,), N, of forces in local cells.  `of_cells`: errors without this condition."""
         return of_cells
 
     @property
@@ -261,7 +271,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d), m, after a step are near a contact, so they follow the Q1 field alone."""
+        """Return which corners (n, 2^d, d), m, are near a contact after a step, and must follow the Q1 field alone."""
         return False
 
     def outside(
@@ -277,10 +287,10 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of re-initialised domains, which keep tracked corners on prescribed sides.
+        """Return new corners (m, 2^d, d), m, of re-initialised domains: on prescribed sides, the tracked corners.
 
-        `ids`, `tracked` and `volume` (m,), m^d, are points, tracked corners and volumes of the domains; `corners` are
-        the corners initialised from F.  A domain with a face on a prescribed side becomes a prism of the given volume.
+        `ids` (m,) are the points, `tracked` the tracked corners, `corners` the corners initialised from F, and `volume`
+        (m,), m^d, the volumes.  A domain with a face on a prescribed side becomes a prism of its volume.
         """
         return corners
 

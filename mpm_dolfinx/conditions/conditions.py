@@ -9,8 +9,8 @@ Reference areas refer to the seeded shape, after the maps.
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
 balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-Values may be functions of time t, reference positions X and current positions x.  Their parameter names decide which
-they receive, see `validation`.
+Values may be functions of time t, reference positions X and current positions x.  The names of a function's parameters
+decide which of these it receives, see `validation`.
 
 An invalid condition raises a ValueError when the condition, a scene or a stage is created.  An invalid value of a
 function raises the error in the step that needs the value.  A condition is equal only to itself, because values and
@@ -36,7 +36,7 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 class Condition:
     """Base class of conditions.  Lists and arrays are copied, so that later changes to them have no effect.
 
-    `name` is the name of its results, by default kind and side, such as "displacement_top".
+    `name` is the name of the results; by default kind and side of the condition, such as "displacement_top".
     """
 
     name: str | None = field(default=None, kw_only=True, repr=False)
@@ -93,7 +93,7 @@ class Traction(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Pressure(Condition):
-    """Pressure on a side of the bodies that follows the surface: normal to the surface, per current area.
+    """Pressure on a side of the bodies: always normal to the moving surface, per current area.
 
     The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
     pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is
@@ -397,11 +397,6 @@ penalty, multipliers remove the error, see `HoldLoads.augment`.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.
 """
-WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).  Halving
-this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
-finer cells by 3.0e-02.
-"""
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables, because yielding soil is much softer.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
@@ -419,8 +414,7 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
     difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity, a
-    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and of 30 times 4G, 1.01 times the exact
-    pressure.
+    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure; a penalty of 30 (4G) gives 1.01 times.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -441,8 +435,8 @@ class Displacement(Condition):
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell
-        outside the box.  If the box covers at most half of its last cell, the far node of that cell is not prescribed.
+        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell of
+        the side outside the box.  If the box covers at most half of its last cell, that cell's far node stays free.
 
     Raises
     ------
@@ -481,7 +475,7 @@ class _OfPlate(Traction):
 class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies: all faces have the same displacement normal to the side.
 
-    A penalty on the slope of the faces, kappa/2 int |grad_t x_n|^2 dA, keeps the plate flat and prevents tilting.  The
+    A penalty on the slope of the faces, kappa/2 int (grad_t x_n)^2 dA, keeps the plate flat and prevents tilting.  The
     penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters

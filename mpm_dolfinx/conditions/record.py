@@ -31,7 +31,7 @@ class Record:
         Recorded quantity: "acceleration", m/s^2, or "velocity", m/s.
     at_rest
         Whether to correct the accelerations by a linear function of time, so that the motion ends at its initial
-        position with zero velocity.  Without the correction, a record with a non-zero integral ends with a velocity.
+        position with zero velocity.  Without the correction, a record with a non-zero integral ends in motion.
 
     Raises
     ------

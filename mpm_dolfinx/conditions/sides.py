@@ -3,21 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME, TINY
-from mpm_dolfinx.base.validation import Places, line
+from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.conditions.conditions import Displacement
-from mpm_dolfinx.domains.cut_domains import Patches
-from mpm_dolfinx.grid.grid import SIDES, Grid, ranges, rounding
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.grid.grid import SIDES, Grid, rounding
+from mpm_dolfinx.parallel.exchange import over_all
 
 
 class Sides:
@@ -47,7 +45,7 @@ class Sides:
         copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
-            raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
+            raise ValueError(f"{what}, must be one; limit each condition to one group by a region")
         return found
 
     def _of(self, side: str, region: Region | None) -> Surface:
@@ -132,7 +130,7 @@ class Sides:
         faces, grid = self.of(one), self.grid
         for hold in holds:
             if len(hold.axes(grid.dim)) == grid.dim:
-                check_apart(one, faces, hold, self.of(hold))
+                faces.check_apart(self.of(hold), (one, hold))
         x = faces.places()
         for wall, (axis, end) in SIDES[grid.dim].items():
             fixed = not over_all(grid.comm, int(free[grid.wall_nodes(wall)].sum()))
@@ -156,63 +154,19 @@ class Sides:
         copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
+    def meeting(self, one: Surface, other: Surface) -> NDArray[np.float64]:
+        """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
 
-def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the values of user functions on this process.  An error on one process is raised on all processes."""
-    message, value = "", None
-    try:
-        value = ask()
-    except ValueError as error:
-        message = str(error)
-    if message := first(grid.comm, message):
-        raise ValueError(message)
-    return value
+        A mapped body has no common corners with other bodies.
+        """
+        dim, ends = self.grid.dim, np.cumsum([len(body) for body in self.bodies])
+        moved = np.array([i if body.map is not None else -1 for i, body in enumerate(self.bodies)])
 
+        def corners(faces: Surface) -> NDArray[np.float64]:
+            X, of = faces.corners, moved[np.searchsorted(ends, faces.id, side="right")]
+            of = np.broadcast_to(of[:, None, None], (*X.shape[:2], 1))
+            return np.concatenate([X, of], axis=2).reshape(-1, dim + 1)
 
-def on_side(patches: Patches, points: MaterialPoints) -> Places:
-    """Return the function that gives user functions the reference or current positions of points on a side."""
-    return lambda name: patches.X if name == "X" else patches.now(points) + patches.base
-
-
-def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Send rows (cells, positions, values) to the owners of the cells; return local cells, positions and values."""
-    empty = (np.empty(0, dtype=np.int64), np.empty((0, grid.dim)), np.empty((0, width)))
-    parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
-    travel = Exchange(grid.comm, grid.owner(parts[0]))
-    cell, x, values = map(travel.send, parts)
-    return grid.local(cell), x, values
-
-
-def check_apart(one, faces: Surface, other, others: Surface) -> None:
-    """Raise an error if two conditions that exclude each other act on the same part of a face."""
-    first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
-    a, b = ranges(first, stop - first)  # all pairs of faces of the same domain
-    same = faces.face[a] == others.face[b]
-    a, b = a[same], b[same]
-    low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
-    size = faces.X[a, 1] - faces.X[a, 0]
-    common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # or no extent along an axis
-    both = np.flatnonzero(common.all(axis=1))
-    if len(both):
-        x = (low[both[0]] + high[both[0]]) / 2
-        raise ValueError(f"{line(one)} and {line(other)}: both act at {x}, must not; limit them by regions")
-
-
-def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.float64]:
-    """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
-
-    A mapped body has no common corners with other bodies.
-    """
-
-    def corners(faces: Surface) -> NDArray[np.float64]:
-        body = np.searchsorted(np.cumsum([len(b) for b in bodies]), faces.id, side="right")
-        moved = np.array([i if b.map is not None else -1 for i, b in enumerate(bodies)])[body]
-        X = faces.corners
-        return np.concatenate([X, np.broadcast_to(moved[:, None, None], (*X.shape[:2], 1))], axis=2).reshape(
-            -1, dim + 1
-        )
-
-    dim = bodies[0].dim
-    x, near = corners(other), SAME * min(b.spacing.min() for b in bodies) + rounding(one.X)
-    distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
-    return x[distance <= near, :dim]
+        x, near = corners(other), SAME * min(body.spacing.min() for body in self.bodies) + rounding(one.X)
+        distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
+        return x[distance <= near, :dim]

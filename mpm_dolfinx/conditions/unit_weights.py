@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid with the magnitude of the scene's gravity, m/s^2, if constant, to convert its conductivity."""
+    """Return the fluid.  If the scene's gravity, m/s^2, is constant, it converts the fluid's conductivity."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -90,16 +90,16 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(comm, ConditionWarning, f"{what}: at one level they are not in equilibrium", name, weight, of, own)
+            warn(comm, ConditionWarning, f"{what}: at one level, the two are not in equilibrium", name, weight, of, own)
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return a constant gravity, m/s^2, that differs from the one with which conductivities are converted, else None.
+    """Return the last gravity, m/s^2, if conductivities are converted with another one, else None.
 
     Parameters
     ----------
     gravity
-        Gravity at the start of a step, and at times in it, m/s^2.
+        Gravity at the start of a step, and at times in it, m/s^2.  If it varies, it counts only above 9.81 m/s^2.
     """
     first, last = gravity[0], float(np.linalg.norm(gravity[-1]))
     rests = all(np.array_equal(first, g) for g in gravity) and last > 0

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Forces of the walls on the bodies, from the forces on fixed components of nodes."""
+"""Walls of the grid: components that they fix, and their forces on the bodies.
+
+In all functions `walls` maps names of walls to the components that each fixes.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,54 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
+
+
+def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the fixed components of each wall; the wall on the axis also fixes the radial component."""
+    left = walls.get("left", "") if isinstance(walls, Mapping) else None
+    if not grid.has_axis or not isinstance(left, str) or "x" in left:
+        return walls
+    return {**walls, "left": "x" + left}
+
+
+def fixed_nodes(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
+    """Return which displacement components (nodes, d) walls fix; raise ValueError for invalid walls."""
+    d = grid.dim
+    out = np.zeros((len(grid.node_x), d), dtype=bool)
+    if not isinstance(walls, Mapping):
+        raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
+    for wall, axes in walls.items():
+        if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
+            raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
+        for a in axes:
+            out[grid.wall_nodes(wall), "xyz".index(a)] = True
+    return out
+
+
+def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which components (n, 2^d, d) of domain corners at walls the walls fix."""
+    out = np.zeros(corners.shape, dtype=bool)
+    for name, axes in walls.items():
+        axis, end = SIDES[grid.dim][name]
+        at_wall = np.abs(corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.finest[axis]
+        for letter in axes:
+            out[:, :, "xyz".index(letter)] |= at_wall
+    return out
+
+
+def stopped(
+    grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return corners (n, 2^d, d), m, clipped to fixed walls; and to other sides, if they were inside `before`."""
+    shut = np.zeros((2, grid.dim), dtype=bool)
+    for name, axes in walls.items():
+        axis, end = SIDES[grid.dim][name]
+        shut[end, axis] = "xyz"[axis] in axes
+    corners = np.where(shut[0] | (before >= grid.low), np.maximum(corners, grid.low), corners)
+    return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
 
 
 def wall_forces(
@@ -16,14 +66,11 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), N, of each wall by name; all processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of them is
-    normal to it, they share the force evenly.
-    The axis of revolution has no area, so its radial force is zero.
+    If several walls fix a component of a node, the wall normal to this component carries the force, or all of them
+    carry it evenly if none is normal.  The axis of revolution has no area, so its radial force is zero.
 
     Parameters
     ----------
-    walls
-        Names of the walls, and the components that each fixes.
     dofs : (n,)
         Local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.
     forces : (n,), N

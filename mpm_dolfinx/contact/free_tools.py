@@ -61,10 +61,10 @@ class FreeTools(ContactProblem):
     placed
         Arguments of `ToolLoads`.
     mass, guides
-        Masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  Projections (k, q, q) on
-        the motions that each tool can perform, see `motion_count`.
+        `mass`: masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  `guides`:
+        projections (k, q, q) on the motions that each tool can perform, see `motion_count`.
     velocity, pushes
-        Velocities (k, q), m/s and rad/s, at the start of the step.  Loads (k, q), N and N m.
+        `velocity`: velocities (k, q), m/s and rad/s, at the start of the step.  `pushes`: loads (k, q), N and N m.
     """
 
     couples = True
@@ -112,9 +112,6 @@ class FreeTools(ContactProblem):
         """Return velocities and accelerations of the tools after the substep."""
         acceleration = self._rate * (self.found(at).motion - self._free)
         return self.flight.after(acceleration, self.shares.own, self.shares.before)
-
-    def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._motion(w))
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         found = super()._find_at(w, motion)
@@ -195,22 +192,17 @@ class FreeTools(ContactProblem):
         share = (np.abs(off) / np.where(scale > 0, scale, 1.0)).max(axis=1)
         return MotionEquation(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 
-    def pattern(self, unknowns) -> PETSc.Mat | None:
-        """See `Loads`: all nodes under a free tool are coupled."""
-        out = None
-        for number in np.flatnonzero(self._free_tools):
-            own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
-            more = outer(own, own)
-            out = more if out is None else out + more
-        out.zeroEntries()
-        return out
+    @property
+    def _loaded(self) -> NDArray[np.int64]:
+        """Indices of the free tools, see `ContactProblem`."""
+        return np.flatnonzero(self._free_tools)
 
     def coupling(self, at: At) -> PETSc.Mat:
         """See `Loads`."""
         K = super().coupling(at)
         found = self.found(at)
         inverse = self._equation(found).inverse
-        for k in np.flatnonzero(self._free_tools):
+        for k in self._loaded:
             on = (np.arange(len(inverse)) == k)[:, None]
             for e, to in zip(np.eye(inverse.shape[1]), inverse[k].T, strict=True):
                 if to.any():

@@ -32,7 +32,7 @@ class Contact:
     adhesion
         Additional shear strength of the contact, Pa, >= 0, as for a `Tool`.
     name
-        Name of its results; by default "contact".
+        Name of the results; by default "contact".
 
     Raises
     ------
@@ -87,7 +87,7 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
             raise ValueError(f"{what}, must be in one; name all bodies of a group in each of its contacts")
         between = sum({*pair} == {one, other} for pair in pairs)
         if between != 1:
-            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {between}, must have one contact")
+            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {between} contacts, must have one")
     if missing := set(range(count)) - {body for group in groups for body in group}:
         raise ValueError(f"contacts: body {min(missing)} is in no group, must be in one")
     return groups

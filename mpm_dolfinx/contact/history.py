@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -39,13 +39,13 @@ class Origin:
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
-    number: NDArray[np.int64]  # number of the contact (n,)
+    number: NDArray[np.int64]  # index of the contact (n,)
     area: NDArray[np.float64]  # contact area (n,), m^(d-1)
 
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with means of pressures `push` (m,) and tractions `shear` (m, d), Pa, of their pairs."""
+        """Return the points with means, over the pairs of each, of pressures `push` (m,) and tractions `shear`, Pa."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -60,3 +60,17 @@ class Origin:
             if contact.grips:
                 data[shear_name(name)] = np.stack(means[1:], axis=1)
         return replace(points, data=data)
+
+
+def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
+    """Return the origin of the flagged pairs (m,) of two contacts, and the indices of these pairs in its order."""
+    columns, start = [], 0
+    comm = both[0].exchange.comm
+    for of, rows in zip(both, kept, strict=True):
+        sent = np.stack([rows, start + np.cumsum(rows) - 1, np.full(len(rows), comm.rank)], axis=1).astype(np.int64)
+        sent = of.exchange.back(sent)
+        columns.append([values[sent[:, 0] > 0] for values in (*sent[:, :0:-1].T, of.point, of.number, of.area)])
+        start += int(rows.sum())
+    owner, index, *own = (np.concatenate(values) for values in zip(*columns, strict=True))
+    exchange = Exchange(comm, owner)
+    return Origin(exchange, *own), exchange.send(index)

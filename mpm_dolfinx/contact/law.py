@@ -7,8 +7,8 @@ At a position with gap g, the contact pressure and its energy per area are
 
 The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier lambda has one value for each
 contact and cell, which starts from the pressure of the previous step.  Augmentation (Uzawa's method) updates lambda
-until the mean penetration in each cell is below `DEPTH`.  Friction depends on the mean slip s of the cell in the step,
-and on the shear traction t_n of the points after the previous step,
+until the mean penetration in each cell is below `DEPTH`.  Friction depends on means over the pairs in a cell: the slip
+s in the step, and the shear traction t_n after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
@@ -17,16 +17,14 @@ with the projection P on the tangent plane.  Sticking contact is elastic with st
 The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
 cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
 traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
-that opens slips afterwards; if it had returned from slip to stick before, it slips for good.  Otherwise shear alone
+that opens is set to slip; if it had returned from slip to stick before, it never sticks again.  Otherwise shear alone
 could open and close the contact under a round tool at first contact, where the mean normal is inclined.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-
-from mpi4py import MPI
 
 import numpy as np
 import scipy.sparse
@@ -44,9 +42,10 @@ STIFF = 100.0
 """Stiffness k in units of (resistance) / (cell size)."""
 GRIP = 6.0
 """Stiffness k_t in units of (resistance) / (cell size).  A larger k_t allows shears that cancel at the nodes."""
-DEPTH = 5e-4  # cells: allowed mean penetration
+DEPTH = 5e-4  # allowed mean penetration / cell size
 SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations
+BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
 """k is multiplied by STIFFER if an augmentation leaves more than the fraction SLOW of the penetration."""
 RAMP = 10.0  # largest ratio of adhesion to normal pressure
@@ -54,17 +53,15 @@ RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State of the contact iterations, without displacements.  Each contact has one condition per cell, k in all."""
+    """State of the contact iterations, without displacements.  There are k conditions: one per contact and cell."""
 
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
     resticks: NDArray[np.bool_]  # whether the condition has returned from slip to stick (k,)
     parts: NDArray[np.bool_]  # whether the condition has opened after this return (k,)
     stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
-    raised: float = 1.0  # factor on the stiffness k
-    off: float = np.inf  # penetration after the last augmentation, cells
-    rounds: int = 0  # number of augmentations
-    follows: int = 0  # number of updates of the pairs
+    # factor on the stiffness k, penetration after the last augmentation, cells, and numbers of augmentations and of
+    updates: NDArray[np.float64]  # updates of the pairs (k, 4): the same for all conditions of a connected part
 
     @property
     def slips(self) -> NDArray[np.bool_]:
@@ -106,11 +103,12 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Contact and cell of each condition (k,), combined in one number."""
+        """Key of each condition (k,): (index of the contact) * (number of local cells) + local cell."""
+        self.cell = key % self.grid.num_local
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
         self.strength = strength[key // self.grid.num_local]
-        h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (key % self.grid.num_local, pairs.cell))
+        h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
         self._stiffness, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
         self.grips = any(contact.grips for contact in contacts)
@@ -118,8 +116,8 @@ class ContactLaw:
     def begins(self) -> ContactState:
         """Return the initial state: pressures of the previous step, and stick everywhere."""
         k, d = len(self.key), self.grid.dim
-        none = np.zeros(k, dtype=bool)
-        return ContactState(self.mean(self.pairs.pressure), np.zeros((k, d)), none, none, np.zeros((k, d)))
+        none, zero = np.zeros(k, dtype=bool), np.zeros((k, d))
+        return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (k, ...) of values (m, ...) of the pairs of each condition."""
@@ -135,13 +133,13 @@ class ContactLaw:
 
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
         """Return the stiffness k (m,), Pa/m, of the pairs."""
-        return state.raised * self._stiffness
+        return state.updates[self.of, 0] * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
         """Return forces and derivatives for pairs with a geometry `at`."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        # only rounding: light bodies penetrate less than 1e-8 cells
+        # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
         rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         touches = (push > 0) | (at.gap <= rounding)
         pressure = self.mean(push)
@@ -159,7 +157,7 @@ class ContactLaw:
     ) -> tuple:
         """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        Means of the conditions (k, d): normals n, slips, m, and tractions before the step `old`, Pa.
+        Means over the pairs of each condition (k, d): normal `n`, `slip`, m, and traction before the step `old`, Pa.
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -167,7 +165,7 @@ class ContactLaw:
         trial = np.einsum("kij,kj->ki", P, old * on[:, None] - hold[:, None] * slip)
         size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
-        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # reversed slip keeps its shear until updated
+        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # else the shear stays until the next update
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
         scale = hold * np.where(slips, onward * most / size, 1.0)
         grip = scale[:, None, None] * (P - along[:, :, None] * along[:, None, :])
@@ -231,36 +229,36 @@ class ContactLaw:
         resticks = state.resticks | (before & ~slips)
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
-    def augmented(self, state: ContactState, touch: Touch, x: NDArray[np.float64]) -> ContactState:
-        """Return the state with lambda set to the pressures; unchanged if mean penetrations are small enough.
+    def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
+        """Return the state with lambda set to the pressures in parts with large penetrations, or raise NotConverged.
 
-        `x` (m, d), m, are the positions of the points.  Raise NotConverged after ROUNDS augmentations.
+        `largest` returns the largest value in the part of each condition (k,).
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
+        x = self.pairs.x
         plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
-        whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.key % self.grid.num_local)))
+        whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.cell)))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
-        most = over_all(self.grid.comm, float(off.max(initial=0.0)), MPI.MAX)
-        if most <= DEPTH:
+        most = largest(off)
+        if not over_all(self.grid.comm, int((most > DEPTH).sum())):
             return state
-        if state.rounds == ROUNDS:
-            number = self.key // self.grid.num_local
-            worst = np.flatnonzero(off == most)[:1]
-            where = [f"{line(self.contacts[number[k]])}: at {x[self.of == k][0] + self.grid.base}" for k in worst]
-            message = f"{''.join(where)} penetrates by {most:.2g} cells: does a wall fix the body there?"
-            raise NotConverged(first(self.grid.comm, message if where else ""))
+        message = ""
+        for k in np.flatnonzero((most > DEPTH) & (off == most) & (state.updates[:, 2] == ROUNDS))[:1]:
+            name, where = line(self.contacts[self.key[k] // self.grid.num_local]), x[self.of == k][0] + self.grid.base
+            message = f"{name}: at {where} penetrates by {most[k]:.2g} cells: does a wall fix the body there?"
+        if message := first(self.grid.comm, message):
+            raise NotConverged(message)
         # the pore fluid, or a nearly incompressible body, is stiffer than k
-        raised = state.raised * (STIFFER if most > SLOW * state.off else 1.0)
-        return replace(state, pressure=touch.pressure, raised=raised, off=most, rounds=state.rounds + 1)
+        updates = state.updates + np.array([0, 0, 1, 0])
+        updates[:, 0] *= np.where(most > SLOW * updates[:, 1], STIFFER, 1.0)
+        updates[:, 1] = most
+        updates = np.where(most[:, None] > DEPTH, updates, state.updates)
+        return replace(state, pressure=np.where(most > DEPTH, touch.pressure, state.pressure), updates=updates)
 
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
         """Return the rounding errors of the forces (m,), N, of the pairs."""
-        return self.rounding_of_gap * self.stiffness(state) * self.pairs.area
-
-    @property
-    def rounding_of_gap(self) -> NDArray[np.float64] | float:
-        """Rounding error of gaps, m: (m,) for each pair, or one value for all."""
-        return 4 * EPSILON * self.pairs.largest_coordinate
+        of_gap = 4 * EPSILON * self.pairs.largest_coordinate
+        return of_gap * self.stiffness(state) * self.pairs.area
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""
@@ -274,14 +272,14 @@ class ContactLaw:
         Shape (contacts, 3) in 2D, (contacts, 6) in 3D.  In axisymmetry moments are zero, and the radial force is the
         integral of the outward traction.
         """
-        force, arm = self.pairs.sign[self.pairs.number, None] * touch.force, at.arm * (not self.grid.axisymmetric)
+        force, arm = self.pairs.sign[:, None] * touch.force, at.arm * (not self.grid.axisymmetric)
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
         return self.by_contact(np.hstack([force, cross]))
 
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep their deviation from the mean of the cell, because repeated averaging would cause creep.
+        In stick, pairs keep deviations of shear tractions from the mean in a cell; repeated averaging causes creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

@@ -21,7 +21,6 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
 from mpm_dolfinx.conditions.acting import Loads, Place, Setting
@@ -36,19 +35,20 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, in cells, that may close in a step.  Steps with larger motion are rejected."""
+"""Largest gap / cell size that may close in a step.  Steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Gap, in cells, above which faces cannot touch before the next update of the pairs."""
+"""Gap / cell size above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration, in cells, above which a position lies behind a thin body and is not paired."""
+"""Penetration / cell size above which a position lies behind a thin body and is not paired."""
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""Distance from points on the other surface, in cells, within which corners follow the Q1 field."""
+"""(Distance from points on the other surface) / cell size below which corners follow the Q1 field."""
 PLACES = 1 << 32
-"""Number that exceeds the quadrature points of any process on a surface."""
+"""Upper bound of the number of quadrature points of a process on a surface."""
 
 
 class Facets(NamedTuple):
@@ -86,16 +86,13 @@ class Contacts(Touching):
     def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
         super().__init__(setting, contacts)
         sides, self.contacts = setting.sides, tuple(contacts.values())
-        self._faces: list[tuple[Surface, Surface]] = []
-        signs = []
-        for contact in self.contacts:
-            both = contact.groups(len(sides.bodies))
-            faces = [sides.around(group) for group in both]
-            whole = [_extent([sides.bodies[i] for i in group]) for group in both]
-            swap = whole[1] < whole[0]  # the same in all stages, and for any order of the bodies
-            self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
-            signs.append(-1.0 if swap else 1.0)
-        self._signs = np.array(signs)
+        self._rank = _ranks(setting)
+        self._faces: list[tuple[int, Surface, Surface, int]] = []  # contact, own and opposite faces, sign of forces
+        for number, contact in enumerate(self.contacts):
+            both = [sides.around(group) for group in contact.groups(len(sides.bodies))]
+            for sign, (own, other) in ((1, both), (-1, both[::-1])):
+                if not len(own) * len(other) or self._rank[own.id].min() < self._rank[other.id].max():
+                    self._faces.append((number, own, other, sign))
         self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
         self._cell_pairs: Latest[NDArray[np.int64]] = Latest()
 
@@ -122,16 +119,16 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found for the points `seen`, whose current positions are `present`.
+        """Return the contact law of pairs that were found for the points `seen`.
 
-        `points` are the points at the start of the step, with the contact history.
+        `points` are the points at the start of the step, with the contact history; `present` are the current points.
         """
         grid = self.grid
         d = self.grid.dim
         rows = []
         off = ""
         own = self._materials.table(cut.points, resistance)
-        for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
+        for i, ((number, faces, others, sign), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
             now = facets if present is seen else self._facets(cut, others, present)
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
@@ -153,8 +150,9 @@ class Contacts(Touching):
                 old = _turned(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
             resistances = np.minimum(own[at], now.resistance[other])
-            place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
-            scalars = np.stack([np.full(len(row), number), place, size, resistances, pressure], axis=1)
+            place = (i + grid.comm.rank * len(self._faces)) * PLACES + row
+            fixed = np.full((len(row), 2), [number, sign])
+            scalars = np.column_stack([fixed, place, size, resistances, pressure])
             offset = patches.now(present)[row] - y
             rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, offset, old])))
         if off := first(grid.comm, off):
@@ -162,27 +160,27 @@ class Contacts(Touching):
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
-        number, place = sent[:, :2].T.astype(np.int64)
-        x, y, n, offset, shear = np.split(sent[:, 5:], 5, axis=1)
-        own = number, grid.local(cell), *sent[:, 2:5].T, shear, x, self._signs
+        number, sign, place = sent[:, :3].T.astype(np.int64)
+        x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)
+        own = number, grid.local(cell), *sent[:, 3:6].T, shear, x, sign
         pairs = FacePairs(grid, *own, other, y, n, offset, place)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
-            exchange, at, values[:, 0].astype(np.int64), values[:, 2]
+            exchange, at, values[:, 0].astype(np.int64), values[:, 3]
         )
 
     def _opposite_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
         """Return the facets and pairs of each contact, see `_opposite`."""
-        return [self._opposite(cut, *faces, points) for faces in self._faces]
+        return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of cells (m,), as number first * cells + second, that contact pairs may occupy in the step.
+        """Return all pairs of cells (m,), as integers first * cells + second, that contact pairs may join in the step.
 
         These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells.
         """
         grid = self.grid
         keys = []
         count = len(self.grid.owners)
-        for (faces, _), (facets, pairs) in zip(self._faces, found, strict=True):
+        for (_, faces, *_), (facets, pairs) in zip(self._faces, found, strict=True):
             patches = cut.surface(faces)
             where = _on(facets.cut[pairs.facet], pairs.t)
             keys.append(patches.cell[pairs.row] * count + self._under(facets, pairs.facet, where))
@@ -232,6 +230,7 @@ class Contacts(Touching):
         row, column = np.nonzero(near < len(facets.x))
         other = near[row, column]
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
+        facing &= self._rank[faces.id[patches.face[row]]] < self._rank[others.id[facets.face[other]]]
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
         h = self._sizes(x[row])
@@ -242,9 +241,9 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) just inside faces at positions x (m, d), or else the cells of the chosen facets.
+        """Return the cells (m,) just inside the chosen facets at positions x (m, d).
 
-        A cell must contain a quadrature point of the face.
+        If a cell contains no quadrature point of the face, the cell of the facet is returned in its place.
         """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
@@ -258,7 +257,7 @@ class Contacts(Touching):
         """
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
-        for pair in self._faces:
+        for _, *pair, _ in self._faces:
             for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, points).x
                 rows = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
@@ -298,13 +297,13 @@ class Contacts(Touching):
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
         """Return a message with depth and position of an overlap of groups, or "" if none overlap."""
         h, comm = self.grid.least, self.grid.comm
-        for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
+        for number, faces, others, _ in self._faces:
             _, pairs = self._opposite(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
                 where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
-                return f"{line(contact)}: bodies overlap by {-deepest / h:.3g} cells at {where}"
+                return f"{line(self.contacts[number])}: bodies overlap by {-deepest / h:.3g} cells at {where}"
         return ""
 
 
@@ -336,11 +335,23 @@ class ContactLoads(ContactProblem):
         self._contacts.check_end(self._cut, points, before)
 
 
-def _extent(bodies: Sequence[Body]) -> tuple:
-    """Return a key that sorts groups of bodies by surface area, then by seeded extent."""
-    area = surface(bodies, None).area0.sum()
-    corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
-    return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
+def _ranks(setting: Setting) -> NDArray[np.int64]:
+    """Return the rank (points,) of the connected part of each point, by surface area and then by extent.
+
+    The order of two parts is the same in all stages, in any order of the bodies, and next to any other part.
+    """
+    grid, bodies = setting.grid, setting.sides.bodies
+    corners = np.concatenate([body.corners() for body in bodies])
+    copy = np.asarray(grid.copy(np.arange(len(corners))))
+    part = parts_of_domains(grid, corners + NEAR * (corners.mean(axis=1, keepdims=True) - corners), copy)
+    start = np.cumsum([0, *map(len, bodies)])
+    area = np.zeros(part.max() + 1)
+    for group in np.unique(copy):
+        faces = surface(bodies, None, None, [copy[i] == group for i in start[:-1]])
+        area += np.bincount(part[faces.id], faces.area0, len(area))
+    extents = [[end(corners[part == k], axis=(0, 1)) for end in (np.min, np.max)] for k in range(len(area))]
+    keys = [(float(f"{size:.9g}"), *low, *high) for size, (low, high) in zip(area, extents, strict=True)]
+    return np.argsort(sorted(range(len(keys)), key=keys.__getitem__))[part]
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:

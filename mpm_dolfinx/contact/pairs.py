@@ -19,12 +19,11 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere
 
 
 class Geometry(NamedTuple):
@@ -43,14 +42,14 @@ class Pairs:
     """Contact pairs of m points in cells that this process owns."""
 
     grid: Grid
-    number: NDArray[np.int64]  # number of the contact (m,)
+    number: NDArray[np.int64]  # index of the contact (m,)
     cell: NDArray[np.int32]  # local cell of the point (m,)
     area: NDArray[np.float64]  # area of the surface that the point represents (m,), m^(d-1)
     resistance: NDArray[np.float64]  # reference modulus, the lower value of both sides (m,), Pa, see `conditions`
     pressure: NDArray[np.float64]  # contact pressure at the point before the step (m,), Pa
     shear: NDArray[np.float64]  # shear traction at the point before the step (m, d), Pa
     x: NDArray[np.float64]  # position of the point in the undeformed grid (m, d), m
-    sign: NDArray[np.float64]  # sign of the forces on points in the results (contacts,)
+    sign: NDArray[np.float64]  # sign of the forces on points in the results (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at w (m, d), m.
@@ -82,7 +81,7 @@ class ToolPairs(Pairs):
     """Contact pairs of points on a surface and tools.  Shear tractions are rotated with the tool."""
 
     tools: Sequence[Tool]  # (contacts,)
-    poses: Sequence[Pose]  # poses of the tools at the end of the substep, loads until its start included (contacts,)
+    poses: Sequence[Pose]  # poses of tools at the end of the substep, without motion by loads in the step (contacts,)
     now: NDArray[np.float64]  # position of the point at the start of the step (m, d), m
     carried: NDArray[np.float64]  # this position after the motion of the tool (m, d), m
 
@@ -114,7 +113,7 @@ class ToolPairs(Pairs):
                 if isinstance(solid, Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
-        everywhere(self.grid, ask)
+        everywhere(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
@@ -132,7 +131,7 @@ class FacePairs(Pairs):
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
     n: NDArray[np.float64]  # outward unit normal of the other side at y (m, d)
     offset: NDArray[np.float64]  # vector from y to the point, without the displacement in the step (m, d), m
-    place: NDArray[np.int64]  # number of the point, the same in all updates of the pairs in a step (m,)
+    place: NDArray[np.int64]  # identifier of the point, the same in all updates of the pairs in a step (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`.  Moments refer to the positions at the start of the step."""
@@ -178,7 +177,7 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return the matrix with these rows of this process, and `columns` local columns.  `own`: all entries are local."""
+    """Return the matrix with these rows of this process and `columns` local columns.  `own`: indices are local."""
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]

@@ -5,11 +5,11 @@ A pair consists of a quadrature point on a surface and the opposite position, on
 With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
 at the start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This
-is repeated until the gaps match the faces at the end of the step.
+is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, D minus their derivative by w, and s = e . D e.  Newton's method solves e . f = load together with
-the equilibrium of the bodies, by
+the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
+together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
@@ -19,7 +19,7 @@ Forces are therefore f + D e (load - e . f) / s; minus their derivative is D - (
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -33,8 +33,8 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
-from mpm_dolfinx.contact.history import Origin, Rough, pressure_name, shear_name
-from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
+from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
+from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
@@ -174,14 +174,18 @@ class ContactProblem(Loads):
         return self.pushed or self._cell_pairs is not None
 
     @property
-    def _still(self) -> NDArray[np.float64]:
-        """Zero displacements of tools by loads: (k,), or with free tools (k, q)."""
-        return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
+    def _loaded(self) -> NDArray[np.int64]:
+        """Indices of the tools that loads move; each of them couples all nodes under it."""
+        return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
 
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
-        key = self.now, at.unknowns, at.u[at.unknowns.owned]
-        return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
+
+        def find() -> Found:
+            w = self._apart_by(self.now.law, at)
+            return self._find_at(w, self._motion(w))
+
+        return self._found((self.now, at.unknowns, at.u[at.unknowns.owned]), find, self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
         """Return the relative displacements w (m, d), m, of the pairs of a law."""
@@ -197,9 +201,6 @@ class ContactProblem(Loads):
             return B, B.createVecLeft()
 
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
-
-    def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._motion(w) if self.pushed else self._still)
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
         law = self.now.law
@@ -223,7 +224,7 @@ class ContactProblem(Loads):
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
-        for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
+        for number in self._loaded:
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
             more = outer(own, own)
             out = more if out is None else out + more
@@ -274,7 +275,12 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (tools,), m, of tools by loads at w (m, d), m, from the last linearisation."""
+        """Return the displacements of tools by loads at w (m, d), m, from the last linearisation.
+
+        Shape (tools,), or before the first substep of free tools (tools, q).
+        """
+        if not self.pushed:
+            return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
         linear, h = self.now.linear, self.grid.least
         if not over_all(self.grid.comm, int((w != linear.w).any())):
             return linear.motion
@@ -356,7 +362,8 @@ class ContactProblem(Loads):
         found = self.found(at)
         law = self.now.law
         state = self.now.state
-        new = law.augmented(state, found.touch, self.pairs.x)
+        part = at.parts.cells[law.cell]
+        new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
         if new is not state or not self.pushed:
             return new is not state
@@ -369,9 +376,9 @@ class ContactProblem(Loads):
         _, touches = self._seek(found)
         failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(failed)[:1]:
-            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain it?"
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain the tool?"
             if reaction[k] == 0:
-                why = "there is no contact within a cell: does it begin at the surface of a body?"
+                why = "there is no contact within a cell: does the tool start at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
         linear = self.now.linear
         motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
@@ -380,19 +387,23 @@ class ContactProblem(Loads):
 
     def follow(self, at: At) -> bool:
         """Update the pairs at u; return whether this changes the equilibrium."""
-        if self._again is None or self.now.state.follows == FOLLOWS:
+        if self._again is None:
             return False
-        new = Current(*self._again(at.u), self.now.state)
-        new, off = self._continued(new, at)
-        if off <= DEPTH:
-            return False
-        self.now = new
-        return True
+        new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
+        if late.any():  # in these parts alone are pairs replaced
+            both = self.now, new
+            chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
+            kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
+            origin, order = joined([of.origin for of in both], kept)
+            law = ContactLaw(new.law.names, new.law.contacts, _merged([of.law.pairs for of in both], kept, order))
+            order = np.argsort(np.concatenate([of.law.key[rows] for rows, of in zip(chosen, both, strict=True)]))
+            self.now = Current(law, origin, _merged([of.state for of in both], chosen, order))
+        return bool(late.any())
 
-    def _continued(self, new: Current, at: At) -> tuple[Current, float]:
-        """Return the contact with pairs found at u, and the largest change of a gap from the current pairs, cells.
+    def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
+        """Return the contact with pairs found at u, and the connected parts (parts,) in which gaps change by `DEPTH`.
 
-        Pairs that are open before and after are ignored.
+        Pairs that are open before and after the update are ignored.
         """
         found = self.found(at)
         law = self.now.law
@@ -406,14 +417,18 @@ class ContactProblem(Loads):
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
             values[new_at] = getattr(state, name)[old_at]
-        fresh = replace(fresh, **carried, raised=state.raised, follows=state.follows + 1)
+        of_old, of_new = at.parts.cells[law.cell], at.parts.cells[now.cell]
+        updates = at.parts.largest(self.grid.comm, of_old, state.updates)
+        updates = np.where(updates < 0, BEGIN, updates)
+        fresh = replace(fresh, **carried, updates=updates[of_new] + [0, 0, 0, 1])
         _, row, old_at = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
         push = found.touch.push
         off, missing = np.maximum(-gap, 0.0), push > 0
         off[row] = np.where((push[old_at] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[old_at]), 0.0)
         missing[old_at] = False
-        most = float(off.max(initial=0.0)) / self.grid.least if not missing.any() else np.inf
-        return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
+        off = np.concatenate([off / self.grid.least, np.where(missing, np.inf, 0.0)])
+        most = at.parts.largest(self.grid.comm, np.concatenate([of_new[now.of], of_old[law.of]]), off)
+        return Current(now, new.origin, fresh), (most > DEPTH) & (updates[:, 3] < FOLLOWS)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
         """Return the points with updated contact pressures and shear tractions at u."""
@@ -423,9 +438,9 @@ class ContactProblem(Loads):
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do work.  Elastic slip in stick counts as dissipation, and is returned on unloading.
+        """See `Loads`.  Only tools do external work.  Elastic slip counts as dissipation, negative on unloading.
 
-        Contact pressures are taken to do no work, because velocities of substeps jump where a gap closes in a step.
+        Contact pressures are taken to dissipate nothing: velocities of substeps jump where a gap closes in a step.
         """
         law = self.now.law
         found = self.found(at)
@@ -434,7 +449,7 @@ class ContactProblem(Loads):
         moves = relative.array_r.reshape(-1, self.grid.dim)
         tool = np.broadcast_to(self.tool_velocity(at), moves.shape)
         shear = law.pairs.area[:, None] * found.touch.shear[law.of]
-        # `push` has counted the power of the tools as a part of the nodes' power
+        # the power of the forces in `push` at the nodes is replaced by the power of the tools
         more = -float((found.balanced * moves).sum()) + float((found.touch.force * tool).sum())
         return -float((shear * (moves - tool)).sum()), more
 
@@ -477,6 +492,13 @@ class ContactProblem(Loads):
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
+
+
+def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
+    """Return the flagged rows of two pairs or states as one, in some order."""
+    names = (f.name for f in fields(both[1]) if f.name != "grid")
+    columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
+    return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SAME, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-ROUNDED = SAME  # cells: a position penetrating less than this lies on the surface
+ROUNDED = SAME  # penetration / cell size below which a position lies on the surface
 DISTANCE = 0.1
 """Largest deviation of the slope of a user's distance function from 1."""
 
@@ -282,8 +282,8 @@ class Cone:
 class Distance:
     """A shape given by a user's signed distance function, with derivatives by finite differences.
 
-    The function is evaluated at true positions.  Increments are powers of two, so that distinct positions do not round
-    to the same value.
+    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two, so
+    that distinct positions do not round to the same value.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m

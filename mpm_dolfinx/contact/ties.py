@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-A penalty resists the difference of the displacements at equal heights: k/2 int |u_one - u_other|^2 dA.  Displacements
+A penalty resists the difference of the displacements at equal heights: k/2 int (u_one - u_other)^2 dA.  Displacements
 are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and opposite.
 """
 
@@ -23,7 +23,6 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Drained, Inflow, Quiet, Rain, Tied, holding
-from mpm_dolfinx.conditions.sides import check_apart, gathered
 from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix, shape_values_in
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
@@ -32,8 +31,8 @@ from mpm_dolfinx.grid.grid import Grid
 class Tie:
     """Two opposite tied sides, and the faces at equal heights.
 
-    `partner` (m,) is the face of the other side for each face of one side.  `offset` (m, d), m, is the vector between
-    both faces.  `axis` is the axis normal to them.
+    For each face of one side, `partner` (m,) is the index of the opposite face, and `offset` (m, d), m, is the vector
+    to this face.  `axis` is the axis normal to the sides.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
@@ -73,7 +72,7 @@ class Ties(Acting):
         excluded = [(one, (of(one),)) for one in setting.of(Quiet, Drained, Inflow, Rain).values()]
         for (one, faces), (other, others) in [*combinations(sides, 2), *product(sides, excluded)]:
             for a, b in product(faces, others):
-                check_apart(one, a, other, b)
+                a.check_apart(b, (one, other))
 
     @property
     def surfaces(self) -> list[Surface]:
@@ -100,7 +99,7 @@ class Ties(Acting):
             stiffness = HOLD * modulus[p.at] * area / grid.sizes_at(p.x).min(axis=-1)
             values = np.concatenate([np.stack([stiffness, other], axis=1), gap, y], axis=1)
             rows.append((p.cell, p.x, values))
-        cell, x, values = gathered(grid, rows, 2 + 2 * d)
+        cell, x, values = grid.gathered(rows, 2 + 2 * d)
         stiffness, other, gap, y = np.split(values, [1, 2, 2 + d], axis=1)
         return TieLoads(grid, cell, x, other[:, 0].astype(np.int64), y, stiffness[:, 0], gap)
 
@@ -113,7 +112,7 @@ class TieLoads(Loads):
     cell, x : (m,), (m, d), m
         Local cells, and positions in them, on one side.
     other, y : (m,), (m, d), m
-        Lexicographic numbers of cells of any process, and positions in them, on the other side.
+        Lexicographic cells of any process, and positions in them, on the other side.
     stiffness : (m,), N/m
         Penalty stiffness.
     gap : (m, d), m

@@ -46,7 +46,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after a further displacement, m, and, if `by_forces` contains it, a rotation, rad."""
+        """Return the pose after further motion `by_forces`: displacement (d,), m, and then a rotation, rad, if any."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
@@ -94,10 +94,10 @@ class Tool:
     direction : (d,)
         Direction of the load, of any length.  In axisymmetry: along the axis.
     mass
-        Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  Weight, load and contact forces
-        move the tool from `displacement`, along `direction` if given, otherwise in any direction.  The tool keeps its
-        position while an initial stress is balanced.  Results are `tool_travel` (d,), m, and the velocity
-        `outcome("tool_velocity")` (d,), m/s.
+        Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  The tool starts from its position
+        after `displacement`.  Weight, load and contact forces move it along `direction`, by default in any direction.
+        The tool keeps its position while an initial stress is balanced.  Results are `tool_travel` (d,), m, and the
+        velocity `outcome("tool_velocity")` (d,), m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
@@ -216,7 +216,7 @@ class Tool:
         return value
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
-        """Return the value of an attribute at time t (s): a number, or a vector (d,) if `dim` is given."""
+        """Return the value of an attribute at time t (s): a number or, if `dim` > 0, also a vector (d,)."""
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:

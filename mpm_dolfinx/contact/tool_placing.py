@@ -22,21 +22,19 @@ from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
 from mpm_dolfinx.conditions.conditions import resistance
-from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
-from mpm_dolfinx.mechanics.given_displacements import held_faces
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # cells: allowed penetration into a body at the start, and into prescribed sides
-NEAR = 0.1  # cells: corners within this distance follow the Q1 field
-STRIDE = 0.02  # cells: a tool thinner than this may pass through points in a step without notice
-LEFT = 1e-3  # cells: penetration that remains at corrected corners; a full projection would roughen the stress
+BEGINS = 1e-2  # allowed penetration / cell size into a body at the start, and into prescribed sides
+NEAR = 0.1  # distance / cell size from a tool below which corners follow the Q1 field
+STRIDE = 0.02  # thickness / cell size of a tool below which it may pass through points in a step without notice
+LEFT = 1e-3  # penetration / cell size that remains at corrected corners; full projection would roughen the stress
 FACING = 0.5  # smallest cosine between the normal of a face and the direction to the tool, if the face faces the tool
 
 
@@ -78,7 +76,7 @@ class Tools(Touching):
     def __init__(self, setting: Setting, tools: Mapping[str, Tool]):
         super().__init__(setting, tools)
         grid, self.tools = setting.grid, tuple(tools.values())
-        self._held = [(hold, faces) for hold, faces, _ in held_faces(setting)]
+        self._held = [(hold, faces) for hold, faces, _ in setting.held]
         """Prescribed displacements with their faces.  Tools must not touch these faces."""
         still = np.zeros(len(self.tools))
         self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None
@@ -150,7 +148,7 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, a first substep needs the displacement that gives the exact velocity, see `in_step`.
+        With inertia, the first of two substeps needs the displacement with the exact velocity, see `in_step`.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -173,7 +171,7 @@ class Tools(Touching):
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments filled with this value, displacements by loads of zero, and initial velocities."""
+        """Return forces and moments filled with this value, zero displacements by loads, and initial velocities."""
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -224,7 +222,9 @@ class Tools(Touching):
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
-            n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
+            n = everywhere(
+                grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T
+            )
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
@@ -237,7 +237,7 @@ class Tools(Touching):
         cell, place, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
-        acts = np.ones(len(self.tools)), self.tools, poses
+        acts = np.ones(len(number)), self.tools, poses
         pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
@@ -247,17 +247,12 @@ class Tools(Touching):
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which of the positions that face a tool lie within half a cell of its edge, where the body continues.
+        """Return which positions facing a tool lie within half a cell of the tool's edge, where the body continues.
 
         The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
         than a cell keeps its whole contact.
 
-        Parameters
-        ----------
-        x, unit : (m, d), m, -
-            Positions on the surface of the bodies, and outward normals.
-        faces : (m,)
-            Which of these positions face the tool.
+        x, unit (m, d): positions on the surface, m, and outward normals; faces (m,): which of these face the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -265,13 +260,13 @@ class Tools(Touching):
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
                 shifted = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = everywhere(grid, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
+                to = everywhere(grid.comm, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
 
         def cells(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return positions, measured in cells."""
+            """Return positions divided by the cell size."""
             return x / grid.h if grid.even else grid.in_cells(x)
 
         low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
@@ -330,20 +325,12 @@ class Tools(Touching):
     def pushed_out(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return corners of domains after a correction that reduces small penetrations of tools to `LEFT`.
+        """Return corners of domains after a correction that reduces small penetrations into tools to `LEFT`.
 
         Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
 
-        Parameters
-        ----------
-        corners : (n, 2^d, d), m
-            Corners of the domains.
-        t
-            Time, s.
-        free : (n, 2^d, d)
-            Components that no other condition prescribes.
-        most
-            Largest penetration that is corrected, cells.
+        corners (n, 2^d, d): corners of the domains, m; t: time, s; free (n, 2^d, d): components that no other condition
+        prescribes; most: (largest penetration that is corrected) / cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
@@ -351,20 +338,20 @@ class Tools(Touching):
             gap += LEFT * h
             at = (gap < 0) & (gap > -most * h)
             own = pose.own(out[at])
-            n = everywhere(self.grid, lambda tool=tool, own=own: tool.solid(h).normal(own))
+            n = everywhere(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
             out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
         """Return the distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
-        gap = everywhere(self.grid, lambda: tool.solid(self.grid.least).distance(own))
+        gap = everywhere(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return a position x (n, d) whose path between two times (s) crosses a tool, or "" if there is none.
+        """Return, as text, a position whose path between two times (s) crosses a tool; "" if there is none.
 
-        Paths are straight.  Steps of the search are as long as the distance to the tool (sphere tracing: Hart 1996).
+        Straight paths from x[0] to x[1] are searched in steps of the distance to the tool (sphere tracing: Hart 1996).
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
@@ -372,15 +359,15 @@ class Tools(Touching):
         done = np.zeros(len(y))
         on = np.arange(len(y))
         along = (end - y) / np.maximum(length, TINY)[:, None]
-        inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
-        a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
-        crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # the middle lies in the tool and changes the side
+        inside = everywhere(self.grid.comm, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
+        a, b = everywhere(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
+        crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # inside, and the nearest side has changed
         if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + done[on, None] * along[on]
-            gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
+            gap = everywhere(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
             inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
@@ -389,9 +376,9 @@ class Tools(Touching):
         return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
-        """Return the largest penetration of positions x (m, d) into a tool, in cells, and the position as text."""
+        """Return (largest penetration of positions x (m, d) into a tool) / cell size, and the position as text."""
         h, pose = self.grid.least, self._pose(tool, t)
-        gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
+        gap = everywhere(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
         place = (
             np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
@@ -450,7 +437,7 @@ class ToolLoads(ContactProblem):
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return the corners, moved out of the tools that they slightly penetrate."""
+        """See `Loads`.  Corners are moved out of the tools."""
         return self._tools.pushed_out(corners, self._place.t, free, np.inf if everywhere else NEAR)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:

@@ -57,9 +57,9 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOSS = 0.03
-"""Lost fraction of a soft material's deformation, in mixed cells, from which a warning is issued."""
+"""A warning is issued if a soft material loses more than this fraction of its deformation in mixed cells."""
 AGAIN = 2.0
-"""Growth of the lost fraction from one warning to the next, as interfaces move to the middle of cells."""
+"""Factor by which the lost fraction grows between two warnings, as interfaces move to the middle of cells."""
 FINE = 0.1
 """Smallest lost fraction of a cell's deformation that counts; stiffness contrasts below 2.1 lose less."""
 
@@ -108,11 +108,11 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return the lost volumes (n,), m^d, of the softest material in owned cells, contrasts (n,), and its pieces (n,).
+    """Return for owned cells (n,) the lost volume of the softest material, m^d, the contrast, and one of its pieces.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M; with equal strain in
-    the cell it is 1 / sum s M.  Their difference, divided by the largest 1/M, is the loss, at most (1 - sqrt(r))^2 of
-    the cell for two moduli of ratio r < 1.
+    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
+    cell gives 1 / sum s M instead.  The loss is the difference of both, divided by the largest 1/M.  It is at most
+    (1 - sqrt(r))^2 of the cell for two moduli of ratio r < 1.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
@@ -129,7 +129,7 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
 COARSE = 0.7  # of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
 FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
 SLENDER = 4  # length / thickness from which a body counts as a beam
-LOST_WET = 2.5  # (lost fraction of a wet beam's stiffness) x n^2: 1.8, 2.3, 3.2 with n = 4, 8, 16, sealed
+LOST_WET = 2.5  # (lost fraction of a wet beam's stiffness) x n^2: in sealed beams 1.8, 2.3, 3.2 with n = 4, 8, 16
 FEW_WET = int((100 * LOST_WET) ** 0.5)  # points with a loss of 1 %.  Source: exact, by LOST_WET
 SLENDER_WET = 2  # length / thickness from which a wet body counts as a beam
 
@@ -138,9 +138,9 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
     """Warn about each slender body that can bend and has too few points over its thickness.
 
     The increment of stress is constant in a cut domain, so n points over the thickness give 1 - 1/n^2 of the bending
-    stiffness in a single step, and more in several (`domain_slopes`).  A single point carries no moment.  Only the
-    increment of a step resists, and the body creeps from step to step.  Saturated bodies (wet) lose more, as measured,
-    and continue to creep.
+    stiffness in a single step, and more in several steps (`domain_slopes`).  A body with a single point carries no
+    moment, and creeps from step to step, because only the increment of a step resists.  Saturated bodies (wet) lose
+    more stiffness, as measured, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -158,7 +158,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
-    """Return the edge along an axis of the cells under a body, m; the mean for unequal cells."""
+    """Return the edge length, m, along an axis of the cells in which a body lies; the mean for unequal cells."""
     if grid.even:
         return grid.h[axis]
     low, high = body.bounds
@@ -166,7 +166,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, with no wall or other body at its two faces across the axis."""
+    """Return whether a body is thin along an axis, with no wall or other body at its two sides normal to the axis."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

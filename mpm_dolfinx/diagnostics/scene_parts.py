@@ -5,11 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import all_of, chosen, functions, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body, check_bodies
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
 def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
@@ -41,6 +45,28 @@ def check_options(
         raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
     elif sources:
         raise ValueError("sources need a fluid")
+
+
+def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
+    """Raise an error for invalid axisymmetric scenes.  Warn about narrow holes around the axis."""
+    if grid.axisymmetric and quadrature == "point":
+        raise ValueError("quadrature 'point': must be domain in axisymmetry")
+    if not grid.has_axis:
+        return
+    x = np.concatenate([body.corners() for body in bodies])
+    inner = x[:, :, 0].min(axis=1)
+    h = grid.h[0] if grid.even else grid.widths[0][0]
+    near = np.flatnonzero(inner < h * (1 - NEAR))
+    row = grid.index(x[near].mean(axis=1))[:, 1]
+    touches = np.zeros(grid.shape[1] + 2, dtype=bool)
+    for k in range(3):  # an inclined surface leaves the axis in the next row of cells
+        touches[row[inner[near] <= NEAR * h] + k] = True
+    hole = near[~touches[row + 1]]
+    if len(hole):  # nodes of the first cells lie on the axis, and are fixed
+        k = hole[inner[hole].argmin()]
+        what = "a hole of radius %.3g m about the axis, at %s, is narrower than a cell of %.3g m: its side moves like "
+        what += "that of a solid core; use smaller cells, or a grid that begins at a radius > 0"
+        warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), h)
 
 
 def _functions_of(terms):

@@ -3,15 +3,15 @@
 
 In bending the true strain varies linearly over a cell, but the strain of a Q1 field jumps at the grid lines.  Particle
 domains that follow the Q1 field acquire a sawtooth strain.  When the motion reverses, other grid lines cross the body,
-and the sawtooth remains as stress.  The corners therefore follow the field with second differences along each axis,
+and the sawtooth remains as stress.  The corner displacement therefore contains second differences along each axis,
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
-with the position t_a in [0, 1] in the cell.  This field is exact for quadratic displacements, equal to Q1 at the nodes,
-and continuous.  D_a is a second difference along the cell edge that ends at node i.  Of the second differences at both
-ends of the edge, D_a is the smaller one, or zero if their signs differ.  If only one end has a second difference, D_a
-is this one.  With cells of several sizes D_a is edge^2 times the divided difference.  Physical kinks, for example at
-the boundary of two materials, are kept.
+with the position t_a along axis a in the cell, from 0 to 1.  This field is exact for quadratic displacements, equal to
+Q1 at the nodes, and continuous.  D_a belongs to the cell edge along axis a that ends at node i.  It is the second
+difference at one end of this edge: the smaller one in absolute value, or zero if their signs differ.  If only one end
+has a second difference, D_a is this one.  If cell sizes vary, D_a is the squared edge length times the second
+derivative of a parabola.  Physical kinks, for example at the boundary of two materials, are kept.
 """
 
 from __future__ import annotations
@@ -19,23 +19,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.grid.grid import Grid, in_chunks
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.grid.grid import Grid, corner_bits, in_chunks
 
 
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return two fields (2, m, d), m: the Q1 displacement of the corners, and its quadratic correction.
+    """Return two fields (2, n, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     Parameters
     ----------
-    cells, x : (m,), (m, d), m
+    cells, x : (n,), (n, d), m
         Owned cells that contain the corners, and positions of the corners.
     u : (nodes, d), m
         Nodal displacements.
     filled : (cells,)
-        Whether local cells contain material.  A node beyond an empty cell may belong to another body.
+        Whether local cells contain material.  Nodes beyond empty cells are not used: they may be of another body.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
@@ -63,8 +62,8 @@ def _polynomial(
 ) -> NDArray[np.float64]:
     """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
 
-    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) are the
-    cells.  The field does not depend on the axis `without`.
+    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
+    index of the cell of each value.  With an axis `without`, the field does not depend on this axis.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -80,9 +79,9 @@ def _polynomial(
 def _second_differences(
     grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
-    """Return the second differences, m, along the edges of owned cells, for each axis.
+    """Return, for each axis, the second differences D_a, m, along the edges of owned cells.
 
-    Each is a polynomial of the other coordinates, with coefficients (d, 2^(d-1), cells) as in `_polynomial`.
+    D_a is a polynomial of the other coordinates, with coefficients (d, 2^(d-1), cells) as in `_polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
@@ -101,7 +100,7 @@ def _second_differences(
             known.append((local >= 0) & filled[local])
             if grid.even:
                 ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
-            else:  # h^2 times the divided difference
+            else:  # h^2 times the second derivative of a parabola
                 h, g = grid.along(cells, a), grid.along(local, a)
                 ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
         first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
@@ -109,7 +108,7 @@ def _second_differences(
         bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
         across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # the same at both ends
         bend = (across[:, low] + across[:, high]) @ bend
-        if not grid.even:  # converts to offsets in m
+        if not grid.even:  # coefficients for offsets in m
             rows = (np.arange(2**d) >> a & 1 == 0).nonzero()[0]
             whole = np.zeros((d, 2**d, len(cells)))
             whole[:, rows] = bend

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from math import prod
 
@@ -23,10 +23,10 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, in cells, for which a cut remains valid.  After larger motion the domains are cut again.
+"""Largest motion of corners / cell size for which a cut remains valid.  After larger motion the domains are cut again.
 
-The reference is a new cut in every step.  In a consolidating column of ten cells, STILL changes pressures by 7e-5 of
-the load, and the settlement by 3e-5 of its value.  Both errors are proportional to STILL.
+Compared with a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
+settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
 """
 
 
@@ -42,7 +42,7 @@ class Patches:
     face, at : (n,)
         Index of the face in `faces`, and index of the material point.
     cell : (n,)
-        Lexicographic number of the cell.
+        Lexicographic index of the cell.
     x, xi : (n, d), m, -
         Position at the last cut, and local coordinates in the domain.
     share : (n,)
@@ -83,6 +83,10 @@ class Patches:
         """Return the current positions (n, d), m."""
         return interpolate(points.corners[self.at], self.xi)
 
+    def positions(self, points: MaterialPoints) -> Callable[[str], NDArray[np.float64]]:
+        """Return the function that gives user functions the reference or current positions."""
+        return lambda name: self.X if name == "X" else self.now(points) + self.base
+
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the current outward area vectors (n, d), m^(d-1)."""
         share = self._share0 / self._whole0
@@ -94,8 +98,8 @@ class Patches:
 class CutDomains(Keyed):
     """Particle domains cut by the cells, and the exchange of their data with the owners of the cells.
 
-    The cut is valid until the points have moved by more than `STILL`.  Until then, shape functions are evaluated at the
-    positions at the time of the cut.
+    The cut is valid until corners have moved by more than `STILL`.  Until then, shape functions are evaluated at the
+    positions that the pieces had when the domains were cut.
 
     Parameters
     ----------
@@ -128,9 +132,9 @@ class CutDomains(Keyed):
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return the largest motion of corners since the cut, in cells, for each connected part (count,).
+        """Return the largest motion of corners since the cut / cell size, for each connected part (count,).
 
-        `part` (n,) is the number of the part to which each point belongs.
+        `part` (n,) is the index of the part to which each point belongs.
         """
         far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
         largest = np.zeros(count) if count > 1 else far.max(initial=0.0, keepdims=True)
@@ -151,7 +155,7 @@ class CutDomains(Keyed):
         return self._exchange.send(values)
 
     def to_pieces(self, values: NDArray) -> NDArray:
-        """Send values (m, ...) from the owners of cells back to the processes of the points, one for each piece."""
+        """Send values (m, ...) of the pieces from the owners of cells back to the processes of the points."""
         return self._exchange.back(values)
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -167,7 +171,7 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means over each point's pieces as `mean` does, but in axisymmetry weighted by area in the plane.
+        """Return each point's mean over its pieces like `mean`; in axisymmetry the weights are areas in the plane.
 
         `values` are values at the centroids of these areas.
         """
@@ -178,7 +182,7 @@ class CutDomains(Keyed):
         return total / whole
 
     def surface(self, faces: Surface) -> Patches:
-        """Return quadrature points on the faces of a surface that belong to points of this process.
+        """Return the quadrature points on a surface, for faces whose points are on this process.
 
         The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Shape
         functions of this cell are extended to the surface, so that loads act on nodes with stiffness.
@@ -186,7 +190,7 @@ class CutDomains(Keyed):
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the quadrature points of several surfaces.  One cut of all surfaces takes the time of one surface."""
+        """Return the quadrature points of several surfaces.  All are cut together, in the time of one surface."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -206,7 +210,7 @@ class CutDomains(Keyed):
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
         outward = face_vectors(corners, number)
         size = np.linalg.norm(outward, axis=1, keepdims=True)
-        skew = skew[here][face].nonzero()[0]  # places are linear over a triangle, but not in xi
+        skew = skew[here][face].nonzero()[0]  # over a triangle, positions are linear, but xi is not
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
         inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
@@ -221,7 +225,7 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 field u (nodes, d) at the points (n, d), for points that are not integrated over domains."""
+        """Return the Q1 field u (nodes, d) at the material points (n, d); only for a cut without `domains`."""
         exchange, cells, x = self._followed
         return exchange.back(self.grid.at(cells, x, u))
 
@@ -235,7 +239,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with the owners of cells, and the cells and positions (m, d), m, of corners or points."""
+        """Exchange with owners of cells; cells and positions (m, d), m, of corners (without `domains`: of points)."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim
@@ -247,7 +251,7 @@ class CutDomains(Keyed):
         return exchange, grid.local(exchange.send(cell)), exchange.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the total displacements (m, d), m, of the pieces' centroids, from the corners of the domains."""
+        """Return total displacements (m, d), m, of the pieces' centroids, computed from the corners of the domains."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # affine fit to the corners
@@ -256,11 +260,11 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic cells (m,) of positions x (m, d), m, in or on the domains of points (m,)."""
+        """Return the lexicographic indices (m,) of the cells of x (m, d), m; x are in or on domains of points (m,)."""
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) of positions in domains; without a piece there, the cell of the largest piece."""
+        """Return the cells (m,) of positions in domains; if a domain has no piece there, its largest piece's cell."""
         pieces, cells = self.pieces, len(self.grid.owners)
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
@@ -273,7 +277,7 @@ class CutDomains(Keyed):
         return cell
 
     def _largest(self) -> NDArray[np.int64]:
-        """Return the largest piece of each point (n,)."""
+        """Return the index of the largest piece of each point (n,)."""
         order = np.lexsort((self.pieces.fraction, self.pieces.point))
         return order[np.cumsum(np.bincount(self.pieces.point, minlength=len(self.points))) - 1]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of particle domains and volume ratios of cells from corner positions, for any path."""
+"""Deformation gradients of particle domains and volume ratios of cells, computed from corner positions for any path."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import TURN, sum_by
-from mpm_dolfinx.points.cutting import FACE_SIGNS, FACES, cross, domain_volumes, volumes
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, TURN, sum_by
+from mpm_dolfinx.points.cutting import cross, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
 
 def gradient(
     corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
 ) -> NDArray[np.float64]:
-    """Return the mean deformation gradient (n, d, d) of particle domains, over the simplices into which they are cut.
+    """Return the deformation gradient F (n, d, d) of each particle domain, the mean over the simplices of the domain.
 
-    In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled to the ratio of the
-    volumes.  (For a twisted hexahedron the unscaled mean differs from this ratio by a second-order term.)  In
-    axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the centroid radii, and det F is
-    the ratio of the ring volumes.
+    In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled so that det F is the ratio
+    of the volumes.  (For a twisted hexahedron, the determinant of the unscaled mean differs from this ratio by a
+    second-order term.)  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
+    centroid radii, and det F is the ratio of the ring volumes.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def _of_hexahedra(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean F (n, 3, 3) over the simplices, and the reference volumes V (n,), m^3.
 
-    F is the sum over the corners k of x_k times dV/dX_k, divided by V.  The last axis of the arrays is the point.
+    F = sum_k x_k dV/dX_k / V, over the corners k.  The last axis of the local arrays is the point.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = _slopes(X)
@@ -73,7 +73,7 @@ def volume_slopes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the volumes (n,) of domains, m^d, and their derivatives (n, 2^d, d) by the corners, m^(d-1).
 
-    In axisymmetry, these are volumes of rings, m^3, integrals of pi r^2 dz around domains, and derivatives, m^2.
+    In axisymmetry the domains are rings: volumes, m^3, are integrals of pi r^2 dz, and the derivatives are in m^2.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:
@@ -94,18 +94,18 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With mean dilatation, the ratio of a cell is the current volume of its domains, from their corners, divided by the
-    reference volume.  This ratio does not depend on the path of deformation, and its variation within the cell does no
-    work.  Ratios that are updated only by increments would drift from the domain volumes, since no force would oppose
-    the drift.  Without mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded
-    soil, because corner volumes are meaningless near plastic flow.
+    With mean dilatation, the ratio of a cell is the current volume of its domains, computed from the corners, divided
+    by the reference volume.  This ratio does not depend on the path of deformation.  Differences between the ratios of
+    domains in a cell do no work: no force would oppose a drift of ratios that are only updated by increments.  Without
+    mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
+    volumes are meaningless near plastic flow.
 
     Parameters
     ----------
     cut, points
         Cut particle domains, and points at the start of the step.
     share : (n,)
-        Exponent of the ratio from corners in a geometric mean with the ratio of the point, in [0, 1]; 0 without mean
+        Weight, in [0, 1], of the ratio from corners in its geometric mean with the ratio of the point; 0 without mean
         dilatation.
     flows : (n,)
         Whether points have yielded.

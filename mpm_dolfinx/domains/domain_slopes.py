@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Deformation gradients that vary linearly within the particle domains of elastic soil.
 
-The gradient F of a domain is a mean.  In bending the gradient varies across the domain.  With one value per domain, and
-n domains over the thickness, the bending stiffness is too small by the fraction 1/n^2.  At a piece of the domain
+The gradient F of a point is the mean over its domain.  In bending the gradient varies across the domain.  With one
+value per domain, and n domains over the thickness, the bending stiffness is too small by the fraction 1/n^2.  At a
+piece of the domain the gradient is
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume),
 
-with the coordinates xi of the domain in units of its edges.  The slopes D are the least-squares fit to the gradients of
-face neighbours of the same material.  e is then corrected so that int dV / det F, summed over the pieces, is the
-reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform fields stay uniform.
+with the local coordinates xi of the domain, in units of its edge lengths.  The slopes D_a are a least-squares fit to
+the gradients F of neighbours of the same material across faces.  e is then corrected so that int dV / det F, summed
+over the pieces, is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform
+fields stay uniform.
 """
 
 from __future__ import annotations
@@ -25,9 +27,8 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import FACES, corner_bits, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.cutting import FACES, corner_bits
 from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
 
 
@@ -41,9 +42,9 @@ class Neighbours:
     bodies
         All bodies of the scene.
     ids : (n,)
-        Numbers of the material points of this process.
+        Identifiers of the material points of this process.
     chosen : (n,)
-        Whether neighbours of each point are sought.
+        Whether to find the neighbours of each point.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):
@@ -55,7 +56,7 @@ class Neighbours:
         for i, body in enumerate(bodies):
             chosen_rows = (of == i).nonzero()[0]
             corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
-            # the same for both domains at a face: the lowest corner of the face, and the corner diagonally opposite
+            # the key of a face is the same in both domains: its lowest corner index, and that of the opposite corner
             first = corners.argmin(axis=2)[:, :, None]
             ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
             key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
@@ -69,9 +70,9 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function from face number to columns, face centres (m) and existence of the neighbours at the face.
+        """Return a function of a face's index: columns, face centres, m, and existence of the neighbours at this face.
 
-        `own` (c, k) are the data (columns) of these points.  `faces` are the centres (d, k), m, of their faces.
+        `own` (c, k) are c data columns of the k points.  `faces` are, for each face index, the face centres (d, k), m.
         """
         centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
@@ -95,10 +96,8 @@ class LinearGradients:
 
     Parameters
     ----------
-    comm
-        Communicator of the processes.
-    bodies
-        All bodies of the scene.
+    comm, bodies
+        Communicator of the processes, and all bodies of the scene.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
@@ -108,7 +107,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, with F varying only in `elastic` points (n,); all processes must call this."""
+        """Return `linear_gradients`, which vary only at `elastic` points (n,); all processes must call this."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils
@@ -137,7 +136,7 @@ def linear_gradients(
     F : (n, k, k)
         Deformation gradients of the points.
     soils : (n, c)
-        Rows of numbers that are equal for points of the same material.
+        Constants of the points' soil.  Points with equal rows have the same material.
     """
     # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction

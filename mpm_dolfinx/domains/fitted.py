@@ -29,14 +29,14 @@ def fitted_at(
     """Return tensors (m, k, k) at positions in particle domains; all processes must call this function.
 
     The fit uses points of the same body and material, weighted by the distance in the reference configuration.  Results
-    at domains that were removed are meaningless.
+    in removed domains are meaningless.
 
     Parameters
     ----------
     sizes
         Number of points of each body of the scene.
     id, xi : (m,), (m, d)
-        Numbers of the points, and local coordinates in their domains; the same on all processes.
+        Identifiers of the points, and local coordinates in their domains; the same on all processes.
     tensor
         Function from material points to their tensors (n, k, k).
     """
@@ -68,7 +68,7 @@ def fitted_at(
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return pairs of positions (m, d) and points at x (n, d) closer than `radius` (m,) along each axis; all in m."""
+    """Return index pairs of `places` (m, d) and points x (n, d) within `radius` (m,) along each axis; all in m."""
     low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Particle domains of yielded soil keep the volumes of their points.
 
-The volume ratio of a point is a mean over its cell, but the corners of its domain follow a field that varies in the
-cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In yielded
-soil F is incremental, so volumes of domains and points would drift apart, and cells would overfill.  After a step the
-corners of yielded domains therefore move by the smallest d with
+The volume ratio of a point is a mean over its cell.  The corners of its domain, however, follow a field that varies in
+the cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In
+yielded soil F is updated by increments, so the volumes of domains and of points would drift apart, and cells would
+overfill.  After a step the corners of yielded domains therefore move by the d that minimises
 
-    sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2  ->  min,
+    sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2,
 
 with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
 held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
-projection); volumes of domains, unlike densities, need no second cut by the grid.
+projection).  Volumes of domains, unlike densities, need no second cut by the grid.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
-"""Weight of the motion, needed because corners of a regular lattice do not change alternating volumes to first order.
+"""Weight of the motion d, needed because in regular lattices no motion changes alternating volumes to first order.
 Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.3e-04 (relative), doubling it by
 3.2e-04, and finer cells by 9.2e-02.
 """
@@ -38,13 +38,13 @@ Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.
 class Domains(NamedTuple):
     """Particle domains of n points."""
 
-    ids: NDArray[np.int64]  # numbers of the points (n,)
+    ids: NDArray[np.int64]  # identifiers of the points (n,)
     corners: NDArray[np.float64]  # corners (n, 2^d, d), m
     volume: NDArray[np.float64]  # volumes of the points (n,), m^d, > 0; in axisymmetry of their rings, m^3
     yielded: NDArray[np.bool_]  # whether to correct the domain (n,)
     free: NDArray[np.bool_]  # components of corners (n, 2^d, d) that may move
-    body: NDArray[np.int64]  # bodies (n,)
-    number: NDArray[np.int64]  # numbers of the corners as seeded (n, 2^d), >= 0; -1 for renewed domains
+    body: NDArray[np.int64]  # index of the body (n,)
+    number: NDArray[np.int64]  # indices of corners in the seeded body (n, 2^d), >= 0; -1 for renewed domains
 
 
 def with_volumes(grid: Grid, domains: Domains) -> NDArray[np.float64]:
@@ -79,9 +79,9 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
 def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return numbers (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,), equal for equal corners.
+    """Return indices (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,); corners that coincide have the same index.
 
-    Corners are equal if they have the same seeded number (n, 2^d), or lie within `tolerance`, m.
+    Corners of a body coincide if they have the same seeded index `number` (n, 2^d), or lie within `tolerance`, m.
     """
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:

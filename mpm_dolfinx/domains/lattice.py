@@ -2,24 +2,24 @@
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
 A displacement wave of the corners with a wavelength of two domains does not move the nodes of the grid, so no stress
-resists it.  Corners that cross grid lines excite such waves, and the waves would grow from cycle to cycle.  The filter
-damps them when the grid is reset.  Along one axis a after the other,
+resists it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
+The filter damps them when the grid is reset.  For each axis a in turn,
 
     d <- d - D_a^T s / 64 D_a d,
 
-and the result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
+The result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
 positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different
-widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), with the
-number c of cells that the corners have crossed; bodies that hardly move are not filtered.  Quadratic fields remain
-unchanged, also at the surface.  A wave of two domains along the axis is reduced by the fraction s, a wave of eight
-domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not filtered
-either: its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by a wall, a
-prescribed displacement, a plate or another body.
+widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), if the
+corners have crossed c cells since the last grid reset.  Bodies that hardly move are not filtered.  Quadratic fields
+remain unchanged, also at the surface.  A wave of two domains along the axis is reduced by the fraction s, a wave of
+eight domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not
+filtered either: its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by
+a wall, a prescribed displacement, a plate or another body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 from mpi4py import MPI
 
@@ -32,15 +32,14 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
-from mpm_dolfinx.grid.grid import SIDES, Grid, among, in_chunks
+from mpm_dolfinx.grid.grid import FACES, Grid, among, in_chunks
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave of two domains that the filter removes, for each crossed cell; at most 1.  Halving this value
-changes the result of scene "cycles" in tests/plateaus.py by 1.5e-04 (relative), doubling it by 3.4e-04, and finer cells
-by 6.2e-03.
+"""Fraction of a wave of two domains that the filter removes per crossed cell; it removes at most the whole wave.
+Halving this value changes the result of scene "cycles" in tests/plateaus.py by 1.5e-04 (relative), doubling it by
+3.4e-04, and finer cells by 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
@@ -48,14 +47,14 @@ MARGIN = len(THIRD) - 1
 
 
 class Lattice:
-    """Lattice of the domain corners of an active body, and the corners that are held.  Meshes are not filtered.
+    """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
 
     Parameters
     ----------
     body, start
-        The body, and the number of its first point.
+        The body, and the identifier of its first point.
     given : (faces, axes)
-        Faces of sides, and the components that a condition prescribes there.
+        Faces on which a condition prescribes displacements, and the prescribed components.
     contacts : (rows, corners)
         Domains (m,) that touch other bodies, and the corners (m, 4) of the touching faces.
     """
@@ -76,7 +75,7 @@ class Lattice:
             self._thirds = [_divided(body.corner_rows(axis)) for axis in range(self._dim)]
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._tolerance = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
-        # stores numbers of held corners: flags for all corners would be as large as the body, on every process
+        # stores indices of held corners: flags for all corners would be as large as the body, on every process
         self._contacts = np.unique(np.take_along_axis(body.nodes(contacts[0]), contacts[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
@@ -93,39 +92,35 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
-        return self._held_of(ids)[0]
+        return self.held_of(ids)[0]
 
-    def corners_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the numbers (m, 2^d) of corners of domains, and which of these corners touch other bodies."""
-        return self._nodes(ids), self._held_of(ids)[1]
-
-    def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return the result of `given`, and which corners (m, 2^d) of the domains touch other bodies."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-            number = self._nodes(ids)
+            number = self.nodes(ids)
             return np.stack([among(number, of_axis) for of_axis in self._given], axis=2), among(number, self._contacts)
 
         return self._held(ids, held)
 
-    def _nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the node numbers (m, 2^d) of the corners of domains."""
+    def nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the indices (m, 2^d) of the corners of domains in the body."""
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the change (m, 2^d, d), m, by which the filter corrects displacements of domain corners.
+        """Return the change (n, 2^d, d), m, by which the filter corrects displacements of domain corners.
 
-        `d` (m, 2^d, d), m, are the displacements; `crossed` (m, 2^d) the numbers of cells crossed since the grid reset.
+        `d` (n, 2^d, d), m, are the displacements; `crossed` (n, 2^d) the numbers of cells crossed since the grid reset.
         """
         if self._count is None:
             return np.zeros_like(d)
-        number = self._nodes(ids)
+        number = self.nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         shape = tuple(np.add(self._count, 1))
         change = _change(comm, shape, number.ravel(), values, self._tolerance, self._thirds).reshape(d.shape)
-        change[self._held_of(ids)[1]] = 0.0
+        change[self.held_of(ids)[1]] = 0.0
         return change
 
 
@@ -141,17 +136,10 @@ def _change(
 
     The lattice is distributed over the processes in slabs along its first axis.
 
-    Parameters
-    ----------
-    shape, number
-        Number of lattice sites along each axis; lexicographic number (m,) of the site of each row of values.  Several
-        rows may belong to one site.
-    values : (m, k + 1)
-        Values, and in the last column the number of crossed cells.
-    tolerance : (k + 1,)
-        Largest difference between rows of a site.  If it is exceeded, the domains have separated; the site is left out.
-    thirds : (4, n - 3) along each axis
-        Weights of third differences of n corners, for domains of different widths, see `_divided`.
+    shape: number of lattice sites along each axis; number (m,): lexicographic number of the site of each row of values.
+    values (m, k + 1): values, and the number of crossed cells.  tolerance (k + 1,): largest difference between rows of
+    a site; if it is exceeded, the domains have separated, and the site is left out.  thirds (4, n - 3) along each axis:
+    weights of third differences of n corners, for domains of different widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -185,7 +173,7 @@ def _change(
 def _filtered(
     d: NDArray[np.float64],
     crossed: NDArray[np.float64],
-    thirds: Sequence[NDArray[np.float64]] | None = None,
+    thirds: Sequence[NDArray[np.float64]] | None,
     axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
     """Return values on a box (..., k) of sites, filtered along some axes (default: all); nan marks missing sites.
@@ -242,40 +230,22 @@ def lattices(
     return out
 
 
-def given(
-    grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
-) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners a condition prescribes, or `walls` (name -> components) fix."""
+def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.bool_]:
+    """Return which components (n, 2^d, d) of corners conditions prescribe."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
         out[rows] = lattice.given(points.id[rows])
-    for name, axes in walls.items():
-        axis, end = SIDES[grid.dim][name]
-        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.finest[axis]
-        for letter in axes:
-            out[:, :, "xyz".index(letter)] |= at_wall
     return out
 
 
-def stopped(
-    grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, clipped to the walls, and to the grid if they were in it `before` a correction."""
-    shut = np.zeros((2, grid.dim), dtype=bool)
-    for name, axes in walls.items():
-        axis, end = SIDES[grid.dim][name]
-        shut[end, axis] = "xyz"[axis] in axes
-    corners = np.where(shut[0] | (before >= grid.low), np.maximum(corners, grid.low), corners)
-    return np.where(shut[1] | (before <= grid.high), np.minimum(corners, grid.high), corners)
-
-
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the numbers (n, 2^d) of corners in their bodies, -1 for renewed domains, and which touch other bodies."""
+    """Return the indices (n, 2^d) of corners in their bodies, -1 for renewed domains, and which touch other bodies."""
     numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
-        numbers[rows], touching[rows] = lattice.corners_of(points.id[rows])
+        ids = points.id[rows]
+        numbers[rows], touching[rows] = lattice.nodes(ids), lattice.held_of(ids)[1]
     return numbers, touching
 
 
@@ -284,7 +254,7 @@ def filtered(
 ) -> NDArray[np.float64]:
     """Return the change of the corners (n, 2^d, d), m, by the filter.
 
-    `then` are the points at the grid reset.  `free` (n,) tells which points are filtered.
+    `then` are the points at the last grid reset.  `free` (n,) tells which points are filtered.
     """
     out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
     for lattice in lattices:

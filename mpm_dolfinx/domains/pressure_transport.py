@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Conservative remap of the pore pressure from one grid to the next, of second order.
+"""Conservative, second-order remap of the pore pressure from one grid to the next.
 
 In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of the cell's storage.  Along an
-axis, the slope s is van Leer's mean of two slopes: to the neighbours across open faces, or to the pressure on a drained
-side.  If one of the two is missing, s is zero.  The slope is then scaled so that the pressure in the cell stays between
-the extremes of cell, neighbours and drained sides.
+axis, s is van Leer's mean of the slopes at both ends of the cell.  The slope at an end leads to the neighbour across an
+open face, or to the pressure on a drained side.  If one of the two slopes is missing, s is zero.  The slope is then
+scaled so that the pressure in the cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
-again.  If a cell contained the domain before, the common part keeps its pressure.  A part of the domain that is new in
-a cell receives the mean pressure of the parts that left other cells.  The centroids of the pieces are remapped in the
-same way.  The error of the remapped centroid, times the mean slope of the domain, corrects the pressure.  The fractions
-of a domain add up to one, and the corrections add up to zero, so the remap is conservative.  Without motion it changes
-nothing.
+again.  In a cell that contained the domain before, the smaller of the old and new fractions keeps its pressure.  A
+fraction that is new in a cell receives the mean pressure of the fractions that left other cells.  The centroids of the
+pieces are remapped in the same way.  The error of the remapped centroid, times the mean slope of the domain, corrects
+the pressure.  The fractions of a domain add up to one, and the corrections add up to zero, so the remap is
+conservative.  Without motion it changes nothing.
 
 Point pressures for output are reconstructed up to no-flow sides, see `up_to_surface`.  They are not transported.
 """
@@ -40,15 +40,15 @@ class PiecePressures:
     Pieces to be moved to the next grid have pressures at their centroids; pieces that stay have pressures of cells.
     """
 
-    id: NDArray[np.int64]  # number of the point (m,)
-    cell: NDArray[np.int64]  # lexicographic cell (m,); -1 at the start
+    id: NDArray[np.int64]  # identifier of the point (m,)
+    cell: NDArray[np.int64]  # lexicographic index of the cell (m,); -1 at the start
     fraction: NDArray[np.float64]  # fraction of the domain (m,)
     pressure: NDArray[np.float64] | None  # pressure at the centroid (m,), Pa; None for pieces that stay
     x: NDArray[np.float64]  # current centroid (m, d), m
     slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for pieces that stay
     bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for pieces that stay
     of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; None for pieces to be moved
-    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None likewise
+    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None to be moved
 
     def __post_init__(self):
         for rows in self.arrays.values():
@@ -81,7 +81,7 @@ class PiecePressures:
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and the pieces of points that are new on the grid; none of them stays on this grid."""
+        """Return these pieces and `other`, pieces of points that are new on the grid; all of them are to be moved."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -94,7 +94,7 @@ class PiecePressures:
 
 
 def at_start(points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of points that were not in a cell before: one piece each, with uniform pressure."""
+    """Return one piece with uniform pressure for each point, for points that were in no cell before."""
     n, p = len(points), points.pressure
     cell = np.full(n, -1)
     slope = np.zeros_like(points.x)
@@ -103,7 +103,7 @@ def at_start(points: MaterialPoints) -> PiecePressures:
 
 
 class CellPressures(NamedTuple):
-    """Pressures of cells, and data for their slopes in n owned cells; c local cells."""
+    """Pressures of the c local cells, and data for slopes in n owned cells."""
 
     cells: NDArray[np.int64]  # owned cells (n,)
     p: NDArray[np.float64]  # pressure (c,), Pa
@@ -165,11 +165,11 @@ class Reconstruction:
     def up_to_surface(
         self, pressures: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return pressures (m,), Pa, at positions in owned cells (n,), of second order also in cells at the surface.
+        """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy also at the surface.
 
-        In a cell at a no-flow side, the slope is that of the next cell inside, or the linear extrapolation of the
-        slopes if this is smaller.  Linear fields are exact, and steep slopes are not continued.  Pressures stay between
-        the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
+        In a cell at a no-flow side, the slope is the smaller of two: that of the next cell inside, and the linear
+        extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
+        stay between the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factors (n,) for cells, at which increments (m,) in a cell stay in [`low`, `high`] (n,)."""
+    """Return for each cell the largest factor (n,) <= 1 that keeps its increments (m,) within [`low`, `high`] (n,)."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -225,7 +225,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, of the new pieces, or their mass potentials, which are additive."""
+    """Return the pressures (m,), Pa, of the new pieces, or mass potentials (additive) if `old` contains these."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -261,7 +261,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor (m,) with which a correction respects the bounds.  It is equal for all pieces of a domain."""
+    """Return the factor (m,) that keeps corrected pressures within the bounds, equal for all pieces of a domain."""
     first = np.diff(owner, prepend=-1).nonzero()[0]
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)

@@ -11,45 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
-from mpm_dolfinx.grid.grid import Grid, ranges, sum_by
-from mpm_dolfinx.points.cutting import (
-    FACES,
-    corner_bits,
-    cut,
-    on_planes,
-    simplex_volumes,
-    sliced,
-    slices_in_cells,
-    vertices,
-    volumes,
-)
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, ranges, sum_by
+from mpm_dolfinx.points.cutting import cut, on_planes, simplex_volumes, sliced, slices_in_cells, vertices, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap, in cells, between faces of two domains that still count as one surface.  Halving this value changes the
+"""Largest gap / cell size between faces of two domains that still count as one surface.  Halving this value changes the
 result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
 """
 CRUMB = NEAR
-"""Area, as a fraction of the cell, below which a part is dropped; other parts receive its mass.  Source: as `NEAR`."""
+"""Area of a part / area of its cell, below which the part is dropped; others receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Area limit, as a fraction of the cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
+"""Area of a part / area of its cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
-Source: definition, a square as wide as half of one of the `EDGES` in a cell.
+Source: definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell.
 """
 COVERED = 0.25
-"""Largest difference between pieces' area and filled area of a cell, in cells.  Source: definition, one domain."""
+"""Largest difference (area of pieces) - (filled area) in a cell / cell area.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
-"""Face of a domain for each edge of the ring of its corners."""
+"""Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
-"""Corners at which each face starts and ends, anticlockwise."""
+"""Corner at which each face starts, and corner at which it ends, anticlockwise."""
 
 
 class Parts(NamedTuple):
     """Parts of the surface, each in one cell; arrays over m parts."""
 
-    row: NDArray[np.int64]  # face (m,)
+    row: NDArray[np.int64]  # index of the face in `OuterFaces` (m,)
     cell: NDArray[np.int64]  # cell (m,)
     x: NDArray[np.float64]  # ends in cell coordinates in [0, 1] (m, 2, 2)
     t: NDArray[np.float64]  # coordinates of the ends along the face, in [0, 1] (m, 2)
@@ -58,27 +48,27 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class OuterFaces:
-    """Faces of domains on the surface of the bodies; arrays over m faces."""
+    """Faces of domains on the surface of the bodies; arrays over n faces."""
 
-    point: NDArray[np.int64]  # material point (m,)
-    face: NDArray[np.int64]  # number of the face in its domain (m,)
-    key: NDArray[np.int64]  # key of the seeded face (m,), see `renewed_faces`
-    area: NDArray[np.float64]  # seeded length (m,), m
-    ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (m, 2, 2), m
+    point: NDArray[np.int64]  # material point (n,)
+    face: NDArray[np.int64]  # index of the face in its domain (n,)
+    key: NDArray[np.int64]  # key of the seeded face (n,), see `renewed_faces`
+    area: NDArray[np.float64]  # seeded length (n,), m
+    ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (n, 2, 2), m
 
 
 class New(NamedTuple):
     """New particle domains; arrays over n domains."""
 
     corners: NDArray[np.float64]  # (n, 4, 2), m
-    group: NDArray[np.int64]  # domains of a group receive values from the same pieces (n,)
+    group: NDArray[np.int64]  # index of the group (n,); its domains receive values from the same pieces
     parent: NDArray[np.int64]  # key of the seeded face for each face, or -1 (n, 4)
     area: NDArray[np.float64]  # seeded length of each face (n, 4), m
     ends: NDArray[np.float64]  # reference positions of the ends of each face (n, 4, 2, 2), m
 
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
-    """Return which domains (n, 4, 2) have an edge longer than `longest` cells, or an inverted part."""
+    """Return which domains (n, 4, 2) have an inverted part, or an edge longer than `longest` times the cell size."""
     ring = corners[:, RING] / grid.h if grid.even else grid.in_cells(corners)[:, RING]
     edge = np.roll(ring, -1, axis=1) - ring
     parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
@@ -92,7 +82,7 @@ class RefilledCells:
     Parameters
     ----------
     grid, points, body
-        Background grid, material points, and the body (n,) of each point.
+        Background grid, material points, and the index (n,) of each point's body.
     flowed, needs
         Whether points (n,) may be renewed, and whether their domains (n,) need renewal.
     faces, signs
@@ -125,7 +115,7 @@ class RefilledCells:
         self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
         """Cells to renew."""
         self.affected = self._at(self.chosen)
-        """Whether points (n,) lose their domains or parts of these."""
+        """Whether each point (n,) loses its domain or a part of it."""
 
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
         """Return the areas (n,), m^2, of cells (n,); one number for equal cells."""
@@ -138,7 +128,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return cells that cannot be renewed, as they contain other points, several bodies, or several conditions."""
+        """Return which cells cannot be renewed, due to points that have not flowed, several bodies or conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -235,7 +225,7 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of each of these cells among the renewed cells, which is the group of its new domains."""
+        """Return the index of each of these cells among the renewed cells, which is the group of its new domains."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
@@ -279,7 +269,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return keys (m,) of edges in cells (m,), and reference positions (m, 2, 2), m, of their ends.
+        """Return the keys (n,) of edges in cells (n,), and the reference positions (n, 2, 2), m, of the edges' ends.
 
         The key is that of the surface part nearest to the middle of the edge.  Reference positions of the ends come
         from the parts nearest to the ends.
@@ -302,7 +292,7 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2), m, at coordinates t (m,) on faces, from 0 at the start to 1."""
+        """Return the reference positions (n, 2), m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
         face = self.faces.face[row]
         flipped = START[face] != FACES[2][face, 0]
         share = np.where(flipped, 1 - t, t)[:, None]
@@ -317,7 +307,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains of cells (n,), with surface faces also on sides of cells that belong to the surface."""
+        """Return new domains in cells (n,); faces on a cell's side join the surface where it runs along this side."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -405,7 +395,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return least-squares slopes (n, 2, k), 1/m, of values (points, k) of the pieces in cells of new domains."""
+        """Return slopes (n, 2, k), 1/m, of point values (points, k) in new domains: fits to the pieces in the cells."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -419,7 +409,7 @@ class RefilledCells:
         normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
         right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
         value, axes = np.linalg.eigh(normal)
-        some = value > SAME  # in cells squared: a single row of pieces determines no slope across the row
+        some = value > SAME  # value: (cell size)^2; a single row of pieces determines no slope across the row
         inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         sizes = grid.sizes_of(np.arange(self.cells))[..., None]
         slope = (axes * inverse[:, None]) @ axes.swapaxes(1, 2) @ right / sizes
@@ -434,10 +424,10 @@ class RefilledCells:
         groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.outside))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
-        return piece, groups, share / whole[pieces.point[piece]]  # with the mass of dropped parts
+        return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped parts
 
     def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return pairs of old and new domains: both indices, and the fraction of the old mass in the new domain."""
+        """Return index pairs of old and new domains, and the fraction of the old mass that each new domain receives."""
         piece, groups, share = self.into
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
@@ -459,7 +449,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return the values (n, ...) of new domains for data on their faces: means over the old surface in the cell."""
+        """Return the values (n, ...) in new domains of point data on faces: means over the old surface in the cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -480,9 +470,9 @@ def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[n
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains (n, 4, 2) into convex polygons; return these with face numbers of edges, and the domain of each.
+    """Divide domains (n, 4, 2) into convex polygons; return these, with the face index of each edge, and their domains.
 
-    `volume` (n,) are the areas of their cells, m^2.
+    `volume` (n,) are the areas of the domains' cells, m^2.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))

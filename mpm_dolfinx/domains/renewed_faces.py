@@ -37,16 +37,16 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 class RenewedFaces:
     """Faces of renewed domains on surfaces; arrays over m faces."""
 
-    row: NDArray[np.int64]  # index of the seeded face among the faces of all these surfaces (m,)
+    row: NDArray[np.int64]  # index of the seeded face among the faces of all surfaces (m,)
     at: NDArray[np.int64]  # index of the point (m,)
-    face: NDArray[np.int64]  # number of the face in its domain (m,)
-    xi: NDArray[np.float64]  # corners of the part of the face in the surface, local coordinates (m, 2, 2)
+    face: NDArray[np.int64]  # index of the face in its domain (m,)
+    xi: NDArray[np.float64]  # local coordinates of the ends of the face's part in the surface (m, 2, 2)
     area: NDArray[np.float64]  # seeded length (m,), m, see `AREA`
     ends: NDArray[np.float64]  # reference positions of the ends (m, 2, 2), m, see `ENDS`
     old: NDArray[np.bool_] | None = None  # if rows are positions: whether each lies on a seeded face (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each position (n,), from its index among renewed faces; negative on a seeded face."""
+        """Return the face of each position (n,), from the face's index among renewed faces; negative if seeded."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -59,7 +59,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of parts and of whole faces, m, and face numbers (n,), after replacement at renewed faces."""
+        """Return areas of parts and whole faces, m, and face indices (n,), with new values at renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
@@ -99,7 +99,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the bounds (m,), (m,), in [0, 1] of the parts of edges (m, 2, 2), m, inside a region (2, 2), m."""
+    """Return where edges (n, 2, 2), m, enter and leave a region (2, 2), m: two fractions (n,) of their lengths."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     edge_vector = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(edge_vector).max(axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reactions of sides at rest, applied as tractions once a body is released."""
+"""Reactions of sides at rest, applied as tractions from the time when a body is released."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return point ids (m,) and tractions (m, d), Pa per reference area, that replace the reactions of sides at rest.
+    """Return for each side at rest point ids (m,) and tractions (m, d), Pa, that replace its reactions.
 
-    Tractions follow from the stresses.  Their resultant forces and moments may not balance a part of the bodies, and
-    would then set this part in motion.  Rigid-body fields of tractions remove this difference.
+    Tractions are forces per reference area, computed from the stresses.  Their resultants and moments on a part of the
+    bodies may differ from those of the reactions.  Rigid-body fields of tractions remove this difference.
 
     Parameters
     ----------

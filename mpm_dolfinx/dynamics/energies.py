@@ -2,7 +2,7 @@
 """Energies of bodies with inertia, and the work of forces on them.
 
 The work of forces f in a step is dt sum b_i f_i . v_i over its substeps, with the weights b_i of the time integration.
-The difference from the change of kinetic energy is the numerical dissipation of the method and of grid resets.
+This work minus the change of kinetic energy is the numerical dissipation of the method and of grid resets.
 """
 
 from __future__ import annotations

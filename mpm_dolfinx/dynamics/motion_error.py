@@ -19,9 +19,9 @@ def motion_error(
 ) -> tuple[float, float]:
     """Return estimated error and size of a step's motion, both as square roots of twice an energy, J^(1/2).
 
-    The difference to a first-order step is seconds (a2 - a1) in velocities and seconds (v2 - v1) in displacements.  The
-    matrix of the substep bounds this difference for unresolved modes, as in Hosea and Shampine (1996).  The estimate is
-    the fraction ERROR of this difference.  The error of a resolved mode is 0.081 omega dt times the difference.
+    The difference to a first-order step is `seconds` * (a2 - a1) in velocities and `seconds` * (v2 - v1) in
+    displacements.  The matrix of the substep bounds this difference for unresolved modes, as in Hosea and Shampine
+    (1996).  The estimate is ERROR times this difference; the error of a resolved mode is 0.081 omega dt times it.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def motion_error(
     flights
         States of motion after the two substeps.
     seconds, own
-        Time weights, s, of the first rate of two, and of the last rate.
+        Time weights in the last substep, s: `seconds` of the rate in the first substep, `own` of the rate in the last.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import Displacement, Quiet
-from mpm_dolfinx.conditions.sides import check_apart, gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import Grid
@@ -32,7 +31,7 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Points on quiet sides: impedances across the normal and their excess along it, kg/m^2/s, and constant forces."""
+    """Points on quiet sides: impedance across the normal, its excess along the normal, kg/m^2/s, constant traction."""
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.points = p = FormPoints(grid, normal=(grid.dim,), across=(), along=(), force=(grid.dim,))
@@ -64,7 +63,7 @@ class QuietSides(Acting):
         self._materials = setting.materials
         self._sides = {name: (side, setting.sides.of(side)) for name, side in sides.items()}
         for (one, faces), (other, others) in combinations(self._sides.values(), 2):
-            check_apart(one, faces, other, others)
+            faces.check_apart(others, (one, other))
         for side in sides.values():
             side.at(0.0, self._grid.dim)
             setting.sides.check_moves(side, setting.of(Displacement).values(), setting.free)
@@ -97,7 +96,7 @@ class QuietSides(Acting):
             push = 2 * (z[:, :1] * incoming + z[:, 1:] * (n @ incoming)[:, None] * n)
             force = push + points.data[traction_name(name)][at] * p.area0[:, None] / size
             rows.append((p.cell, p.x, np.concatenate([size, n, z, force], axis=1)))
-        cell, x, values = gathered(self._grid, rows, 3 + 2 * d)
+        cell, x, values = self._grid.gathered(rows, 3 + 2 * d)
         size, normal, z, force = np.split(values, [1, 1 + d, 3 + d], axis=1)
         forms = self._forms(QuietForms, self._forms.velocity)
         fields = {"normal": normal, "across": z[:, 0], "along": z[:, 1], "force": force}

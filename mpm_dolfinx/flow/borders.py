@@ -32,7 +32,7 @@ class Borders:
     contents
         Material in the cells.
     cells, soils, law
-        Arrays over the m pieces: cell (m,); numbers (m, k) that are equal for the same soil; retention curve (m,).
+        Arrays over the m pieces: cell (m,); constants of the soil (m, k); index of the retention curve (m,).
     facets
         Facets of this process between two active cells.
     mixed
@@ -84,7 +84,7 @@ class Borders:
         contents, flow
             Material in the cells, and conductivities of the filled owned cells.
         places, moved
-            Vectors (c, d), m, for local cells: midpoint to pressure position, and displacement in the step.
+            Vectors (c, d), m, for local cells: from midpoint to pressure position; displacement in the step.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1
@@ -172,7 +172,7 @@ class BorderFaces:
     area: NDArray[np.float64]  # (m,), m^(d-1)
     paths: list[Paths]  # flow paths on both sides, see `through`
     lengths: list[NDArray[np.float64]]  # lengths of these paths (m,), m
-    offsets: list[NDArray[np.float64]]  # vectors along these paths for the weight of the fluid (m, d), m
+    offsets: list[NDArray[np.float64]]  # vectors along paths (m, d), m, for the pressure drops by weight
     weight: NDArray[np.float64]  # unit weight of the fluid (d,), N/m^3
     bulk: float  # bulk modulus of the fluid, Pa
 

@@ -2,12 +2,12 @@
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
 The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
-T = A kappa / d, d is the distance from the centroid of the cell's material to the face, and r is the relative density
-of the fluid.  At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch
-2002) opens faces with outflow, at the start of the substep and then after each solution (`SideFeeds.settle`).
-Infiltration is the rain, but at most the inflow at the pressure of the pond.  Evaporation is at most the outflow at the
-driest pressure.  A pond of volume V supplies V / dt in a step in addition to the rain, uniformly over its side.
-Infiltration, ponding and run-off add up to the rain within rounding.
+T = A kappa / d, with the distance d from the centroid of the cell's material to the face.  r is the density of the
+fluid divided by the density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set
+method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the others: at the start of the substep
+and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at the pressure of the
+pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V supplies V / dt in a step in
+addition to the rain, uniformly over its side.  Infiltration, ponding and run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -24,21 +24,20 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Setting
 from mpm_dolfinx.conditions.conditions import Drained, Inflow, Rain
-from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, on_side
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.exchange import everywhere, over_all
 
 THICK = np.sqrt(2)
-"""Largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
+"""(Area of the largest plane section of a cube) / (area of a face).  Source: exact bound (Ball 1986).
 
-The centroid of a convex body behind a plane is at least its volume / ((d + 1) THICK h^(d-1)) away from the plane.  A
-face that is closer to the centroid of the cell's material, or behind it, bounds only a part of the material, and must
-not drain the whole cell.
+Let a convex body of volume V in a cell lie on one side of a plane.  The distance from its centroid to the plane is at
+least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it, bounds only a
+part of the material.  Such a face must not drain the whole cell.
 """
 
 
@@ -69,8 +68,8 @@ class DrainedSides(Feeding):
         self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
         self.varies = any(callable(getattr(one, name)) for one in outlets.values() for name in one.FUNCTIONS)
         self.varies |= any(self._ponds)
-        for one, other in combinations(self._outlets, 2):
-            check_apart(*one, *other)
+        for (one, faces), (other, others) in combinations(self._outlets, 2):
+            faces.check_apart(others, (one, other))
         self._constant: Latest[OpenSides] = Latest()
 
     @property
@@ -93,11 +92,11 @@ class DrainedSides(Feeding):
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points whose domains have faces on open sides."""
+        """Return the indices of points whose domains have faces on open sides; indices may be repeated."""
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
 
     def placed(self, wet: Wet) -> SideFeeds:
-        """Return the flow through the open sides in a substep, with pressures and inflows at its end."""
+        """Return the flow through the open sides in a substep, with pressures and inflows at the end of the substep."""
         if self.varies:
             return SideFeeds(self._sides(wet), wet, self._names, self._ponds)
         key = (wet.cut.key, wet.contents.key, wet.points)
@@ -108,13 +107,13 @@ class DrainedSides(Feeding):
         grid, rows = self._grid, []
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
-            given, n = everywhere(grid, partial(outlet.through, wet.t, on_side(p, wet.points))), len(p.x)
+            given, n = everywhere(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
             columns = np.empty((n, 5 + grid.dim))
             for k, column in enumerate((i, *given)):
                 columns[:, k] = column
             columns[:, 5:] = p.area(wet.points)
             rows.append((p.cell, p.x, columns))
-        cell, x, values = gathered(grid, rows, 5 + grid.dim)
+        cell, x, values = grid.gathered(rows, 5 + grid.dim)
         number = values[:, 0].astype(np.int64)
         pressure, flux, one_way, driest = values[:, 1:5].T
         area = values[:, 5:]
@@ -140,7 +139,7 @@ class OpenFaces:
     conductance: NDArray[np.float64]  # outflow per unit of the cell's mass potential (m,), m^d/(Pa s)
     inflow: NDArray[np.float64]  # inflow that is prescribed, or caused by the outside pressure (m,), m^d/s
     seeps: NDArray[np.bool_]  # whether fluid can only leave (m,)
-    offset: NDArray[np.float64]  # vector from the centroid of the cell's material (m, d), m
+    offset: NDArray[np.float64]  # vector from the centroid of the cell's material to the face (m, d), m
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
@@ -155,9 +154,9 @@ class OpenFaces:
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction for pressure differences (m,), Pa.
+        """Return the non-orthogonal correction; `difference` (m,), Pa, corrects the cell pressure at each face.
 
-        The correction is a flow to be added, m^d/s, and a fraction of the two-point flux to be added.
+        The correction consists of a flow, m^d/s, and of a fraction of the two-point flux; both are added to this flux.
         """
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
@@ -209,10 +208,10 @@ class UnsaturatedFaces(OpenFaces):
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides, at least one with rain.
+    """Faces on open sides; at least one of the faces has rain.
 
-    The outflow is minus the rain, but at least the outflow at the pond's pressure and at most that at the driest
-    pressure.  The outflow includes seepage, so `seeps` is False.
+    With rain, the outflow is minus the rain, within two limits: the outflow at the pond's pressure, and the outflow at
+    the driest pressure.  This outflow includes seepage, so `seeps` is False at faces with rain.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -277,7 +276,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return sides with the pressure and water supply of ponds in a time dt (s), and the capacities of ponds, m^d.
+        """Return the sides with pressure and water supply of ponds in a time dt, s; and the capacities of ponds, m^d.
 
         `ponds` are the largest depths, m.
         """
@@ -323,7 +322,7 @@ class SideFeeds(Feeds):
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells.  The non-orthogonal correction is that at the start of the substep."""
+        """Return the outflow of the cells.  The non-orthogonal correction is computed at the start of the substep."""
         flux, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)

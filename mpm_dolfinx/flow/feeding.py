@@ -3,7 +3,7 @@
 
 The method `feeding(setting)` of a condition returns a `Feeding`, which is created once in a stage and holds the faces.
 `Feeding.placed` returns the `Feeds` of a substep.  At each assembly of the residual, `Feeds` add flow rates to the
-outflow of the cells.  `conditions/acting.py` has the same interface for the momentum balance.
+outflow of the cells.  `conditions/acting.py` has the corresponding interface for the momentum balance.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class Leaving(NamedTuple):
 
     cells: NDArray[np.float64]  # outflow (n,)
     turnover: NDArray[np.float64] | float = 0.0  # sum of absolute flows, the scale of rounding errors
-    gain: NDArray[np.float64] | float = 0.0  # absolute value of sources, which scales the fluid balance
+    gain: NDArray[np.float64] | float = 0.0  # absolute value of sources, for the scale of errors of the fluid balance
 
 
 class Feeds:
-    """Flow rates of the conditions of one kind in a substep.  A method that is not overridden adds nothing.
+    """Flow rates of the conditions of one kind in a substep.  Methods other than `leaving` add nothing by default.
 
     Arrays have one entry for each of the n active owned cells.  `at` is the result of `conducting` for the current
     displacements.
@@ -131,7 +131,7 @@ class Feeding:
         raise NotImplementedError
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points, with repetitions, at which bodies may gain or lose fluid."""
+        """Return the indices of points at which bodies may gain or lose fluid; indices may be repeated."""
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:

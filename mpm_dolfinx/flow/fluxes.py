@@ -3,8 +3,8 @@
 
 The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
 fluxes through the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the
-material in a cell, its mobility kappa becomes J F^-1 kappa F^-T.  `drained_sides` computes fluxes through open sides;
-`StorageProblem` in `storage` adds up both kinds of fluxes.
+material in a cell, the cell's mobility kappa becomes J F^-1 kappa F^-T.  `drained_sides` computes fluxes through open
+sides; `StorageProblem` in `storage` adds up both kinds of fluxes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
-ALONG = 0.1  # smallest component of the unit normal along an axis, if a side determines the slope along this axis
+ALONG = 0.1  # least component of a side's unit normal along an axis, with which the side determines the slope along it
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Mobility:
     share: NDArray[np.float64] | None = None  # (mobility along each axis) / mean (n, d); None without mixed cells
     # vector from the centroid to the pressure position of the cell (n, d), m; None without mixed cells
     shift: NDArray[np.float64] | None = None
-    # fractions of the mean from soil without a retention curve, and from each curve (n, k)
+    # fractions of the mean that come from soil without a retention curve, and from soil of each curve (n, k)
     shares: NDArray[np.float64] | None = None
     paths: Any = None  # flow paths of mixed cells, see `series`
     borders: Any = None  # faces between cells of different soil
@@ -93,7 +93,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
-        """Return (distance of centroid) / (distance of pressure position) from faces (m,), along normals (m, d).
+        """Return (distance of centroid) / (distance of pressure position), both from faces (m,) along normals (m, d).
 
         `offset` (m, d), m, are the vectors from the centroids to the faces.
         """
@@ -112,7 +112,7 @@ class Conduction:
 class OpenSides:
     """Open sides of the bodies; arrays over m faces.  Each face belongs to one owned cell."""
 
-    number: NDArray[np.int64]  # number of the condition (m,)
+    number: NDArray[np.int64]  # index of the condition (m,)
     cells: NDArray[np.int32]  # cell behind the face (m,)
     shape: NDArray[np.float64]  # area / (distance to the cell's centroid), 0 for a prescribed inflow (m,), m^(d-2)
     pressure: NDArray[np.float64]  # pressure outside (m,), Pa
@@ -149,7 +149,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), Pa, of the outside pressure minus the fluid's weight up to the faces."""
+        """Return the mass potentials (m,), Pa, at outside pressures minus hydrostatic drops from centroids to faces."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
@@ -278,7 +278,7 @@ class CellContents(Keyed):
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at their centroids, for displacements `nodal`, m; `rests` do not move."""
+        """Return the motion of filled cells at centroids, for nodal displacements, m; cells `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = np.eye(d) + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
@@ -362,8 +362,8 @@ class FluxForms:
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
         offset = across * n0 - ufl.jump(self.centroid + self.moved)
         if inertial is not None:
-            # mean over two cells as for the mass, with a sixth of each neighbouring node.  With the value at the face,
-            # freely flowing water would have more mass than all of the soil in modes that alternate between nodes
+            # mean over two cells as for the mass: weights 1/6, 2/3, 1/6 of three nodes in a row.  With the value at the
+            # face, freely flowing water would have more mass than all of the soil in modes that alternate between nodes
             along_n = [ufl.dot(ufl.grad(inertial)(side), n0) for side in "+-"]
             if grid.even:
                 along = ufl.avg(inertial) - across / 6 * (along_n[0] - along_n[1])

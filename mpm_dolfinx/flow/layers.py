@@ -3,16 +3,16 @@
 
 Soils along a line are in series; lines are in parallel.  The mobility along an axis is the mean, over the lines, of the
 harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exact for any number of layers parallel to
-the grid, for flow along and across them.  Inclined layers must be at least a cell thick: only then does a seam bar all
-lines of some cell, and does a drain contain complete lines.
+the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
+conductivity blocks all lines of some cell, and a drain contains complete lines.
 
-The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  With
-s in [0, 1] along the line, the resistance to the lower end is int (1 - s) dR, to the upper end int s dR.  The sum
-of these resistances over all faces of a line is exact.  For layers inclined by more than `INCLINED` the position moves
-to the more conductive end.  Otherwise a drain would be interrupted between rows of cells.  The shape of a piece is
-approximated by the bounding box of its domain in the cell.
+The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  The
+resistance from there to the lower end is int (1 - s) dR, to the upper end int s dR, with s in [0, 1] along the line.
+The sum of these resistances is exact for lines through several cells.  For layers inclined by more than `INCLINED` the
+position moves to the more conductive end.  Otherwise a drain would be interrupted between rows of cells.  The shape of
+a piece is approximated by the bounding box of its domain in the cell.
 
-A conductivity that depends on deformation varies within a cell without layers, see `graded`.
+A conductivity that depends on deformation varies even in cells without layers, see `graded`.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ PAIRS = 2**16
 class Lines:
     """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a piece that it crosses."""
 
-    line: NDArray[np.int64]  # index of the piece at whose centroid the line is drawn, among pieces of mixed cells
+    line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid it runs
     piece: NDArray[np.int64]  # index of the crossed piece
-    length: NDArray[np.float64]  # length in the crossed piece, cells
+    length: NDArray[np.float64]  # length in the crossed piece / cell size
     before: NDArray[np.float64]  # fraction of the piece's resistance below the position of mean pressure
-    total: NDArray[np.float64]  # length of the whole line, cells
+    total: NDArray[np.float64]  # length of the whole line / cell size
 
 
 class MixedCells:
@@ -68,7 +68,7 @@ class MixedCells:
     contents
         Material in the cells.
     soils
-        Numbers (m, k) that are equal for pieces of equal conductivity.
+        Constants (m, k) that are equal for pieces of equal conductivity.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -96,13 +96,13 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return, for each axis, lines through some pieces, the pieces that they cross, and the fraction crossed.
+        """Return for each axis: lines through pieces `rows`, the piece that each crosses, and a weight, < 1 on borders.
 
         `first` and `count` (m,) are the index of the first piece and the number of pieces in the cell of each piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
-        # means of lines on both sides, because borders of pieces lie on a line only within rounding
+        # means of two shifted lines, because borders of pieces lie on a line only within rounding
         places = [self._x[line] + shift for shift in (-NEAR / 2, NEAR / 2)]
         inside = np.mean([(low[piece] <= x) & (x <= high[piece]) for x in places], axis=0)
         out = []
@@ -122,8 +122,8 @@ class MixedCells:
         """Return the mobility of filled cells, from means (n,) and mobilities `kappa` of all pieces, m^2/(Pa s).
 
         `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  `now`
-        are the mobilities of all pieces at their pressures, in unsaturated soil.  If it is given, only inclined layers
-        shift the position of the cell pressure away from the centroid.
+        are the mobilities of all pieces at their pressures, in unsaturated soil.  If `now` is given, only inclined
+        layers shift the position of the cell pressure away from the centroid.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -135,10 +135,10 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities along the axes, and shifts of the pressure position in cells, of mixed cells (n, d).
+        """Return, for mixed cells (n, d), mobilities along the axes, and shifts of the pressure position / cell size.
 
         `kappa` are mobilities of pieces.  If `mean` = 1, shifts lead to the position of mean pressure.  If `mean` = 0,
-        they are caused by inclined layers alone.
+        only inclined layers cause shifts.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -167,7 +167,7 @@ class MixedCells:
         Parameters
         ----------
         kappa, law
-            Mobilities (m,), m^2/(Pa s), of all pieces at saturation, and numbers of their retention curves, < `laws`.
+            Mobilities (m,), m^2/(Pa s), of all pieces at saturation, and indices of their retention curves, < `laws`.
         shift
             Vectors (n, d), m, from the centroids of filled cells to their pressure positions; None if all are zero.
         """
@@ -220,7 +220,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the factor (n,) that is added to a cell's shift if its layers are inclined."""
+        """Return the part (n,) of the factor of each cell's shift that is caused by inclined layers."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -241,8 +241,9 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return (mobility along each axis) / mean (n, d), for a mobility that varies gradually in a cell.
 
-    Along its gradient the pieces conduct in series, across it in parallel.  For other directions, the difference of
-    both means is distributed over the axes, in proportion to the variance of a linear variation along each axis.
+    Pieces conduct in series along the mobility's gradient, and in parallel across it.  For other directions, the
+    arithmetic minus the harmonic mean is distributed over the axes, by the variance of a linear variation along each
+    axis.
 
     Parameters
     ----------
@@ -269,13 +270,13 @@ def graded(
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
     """Return the owned cells with pieces of different conductivity; None if no process has such cells.
 
-    `soils` (m, k) are numbers that are equal for pieces of equal conductivity.
+    `soils` (m, k) are constants that are equal for pieces of equal conductivity.
     """
     grid = cut.grid
     cells = cut.cells
     volume = contents.area
     some = np.zeros((grid.num_local, soils.shape[1]))
-    some[cells] = soils  # numbers of any piece of the cell
+    some[cells] = soils  # constants of any piece of the cell
     mixed = sum_by(cells, (soils != some[cells]).any(axis=1), grid.num_local) > 0
     corners = cut.points.corners
     low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))

@@ -8,11 +8,11 @@ cell, the corrected flux is
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t].
 
-At an open side, p - p_out is replaced by p - p_out + g . t, with the vector t along the side from the foot of the
-centroid.  The gradients are a least-squares fit to the pressures of neighbours and drained sides, and to zero flow
-across no-flow sides.  The area vector of a no-flow side is the one that closes the surface of the material in the cell.
-Linear pressures are exact.  The gradients are limited: corrected pressures at faces stay between the pressures of the
-neighbours.
+At an open side, p - p_out is replaced by p - p_out + g . t.  Here t is the vector along the side, from the foot of the
+perpendicular through the centroid to the centre of the face.  The gradients are a least-squares fit to the pressures of
+neighbours and drained sides, and to zero flow across no-flow sides.  The area vector of a no-flow side is the one that
+closes the surface of the material in the cell.  Linear pressures are exact.  The gradients are limited: corrected
+pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""Offset of two centroids along a face, in cells, up to which they need no correction."""
+"""(Offset of two centroids along a face) / (cell size) up to which fluxes need no correction."""
 NEAREST = 0.1
-"""Lower bound, in cells, of the distances in the weights of the least-squares fit.  Halving this value changes the
-result of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and finer cells by 3.4e-03.
+"""Lower bound of distances in the weights of the least-squares fit / cell size.  Halving this value changes the result
+of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and finer cells by 3.4e-03.
 """
 SIDES = 2.0
 """Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Halving
@@ -101,7 +101,7 @@ class Gradients:
         self._contents, self._sides = contents, sides
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
-        """Return the area vectors (n, d) of no-flow sides in the filled cells, relative to the faces of the cell."""
+        """Return the area vectors (n, d) of no-flow sides in the filled cells, divided by the areas of cell faces."""
         grid, share = contents.grid, contents.open[contents.filled]
         out = -(share[:, :, 1] - share[:, :, 0])
         for axis in range(grid.dim):
@@ -133,7 +133,7 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the pressure gradients minus the unit weight of the fluid (rows, d), Pa/m.
+        """Return the gradients (rows, d), Pa/m: pressure gradient minus unit weight of the fluid.
 
         Parameters
         ----------
@@ -198,7 +198,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether its condition's faces in the cell are not opposite the cell's centroid."""
+    """Return for each face (m,) whether the condition's faces in its cell are not opposite the centroid on average."""
     _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
     at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
     count = int(at.max(initial=-1)) + 1
@@ -208,5 +208,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return vectors (m, d), m, along the faces, from the foot of the cell's centroid to the face's centre."""
+    """Return vectors (m, d), m, along faces: from the foot of the perpendicular through the centroid to the centre."""
     return sides.offset - np.einsum("md,md->m", sides.offset, sides.normal)[:, None] * sides.normal

@@ -6,7 +6,7 @@ unknowns of each face.  Newton's method finds them from the continuity of the fl
 conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
 therefore exact at any offset from the grid.
 
-The lines through a cell (see `layers`) that cross a single soil up to the face conduct in parallel.  All lines that
+Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
 cross several soils are replaced by one line.  Its soils follow in the order along the lines, each with its mean
 fraction of the length.
 """
@@ -30,7 +30,7 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
-    Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; the first is saturated
+    Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; entry 0 is saturated
     soil.  The other lines are replaced by one line with s soils in series.
     """
 
@@ -79,10 +79,10 @@ def none(count: int, laws: int, slots: int) -> Paths:
 class _Links(NamedTuple):
     """Segments of soil along the flow path through a face.  Each connects two nodes, positions with a pressure."""
 
-    face: NDArray[np.int64]  # the face
+    face: NDArray[np.int64]  # index of the face
     low: NDArray[np.int64]  # first node
     high: NDArray[np.int64]  # second node
-    law: NDArray[np.int64]  # number of the retention curve
+    law: NDArray[np.int64]  # index of the retention curve
     conductance: NDArray[np.float64]  # at k_r = 1, m/(Pa s)
     drop: NDArray[np.float64]  # hydrostatic pressure drop, Pa
 

@@ -71,7 +71,7 @@ class Sources(Feeding):
         return SourceFeeds(self, wet)
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the points with pieces in cells that contain a source."""
+        """Return the indices of points with pieces in cells that contain a source; indices may be repeated."""
         return cut.pieces.point[cut.to_pieces(self.gain(pieces)[cut.cells] != 0)]
 
 

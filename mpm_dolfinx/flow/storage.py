@@ -7,14 +7,14 @@
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
 (div u in place of J_Delta would turn rotations into volume changes.)  r = exp(p / K_w) is the fluid density divided by
-the density rho_w at zero pressure.  In zeta, r is taken at the pressure (p_n + p) / 2, on a face as the logarithmic
-mean.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the
-neighbour.  The residual is this equation divided by r; its tangent neglects differences of r.  A is the exact overlap
-of the body with the face.  x+- are the centroids of the material in both cells, and d+- their distances from the face.
-`layers` defines kappa and d of mixed cells.  With distances from the centroids the error is 0.2 % for any filling; with
-half of the cell size it would reach 12 %.  `nonorthogonal` corrects faces between centroids that are offset along the
-face.  The sum of the equations over the cells is the fluid balance.  `fluid_content` defines the change of the content,
-and `time_integration` the integral over a substep.
+the density rho_w at zero pressure.  In the storage term, r is taken at the pressure (p_n + p) / 2; on a face, r is the
+logarithmic mean over both cells.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass
+that leaves a cell enters the neighbour.  The residual is this equation divided by the r of storage; the tangent
+neglects that r of a face differs.  A is the exact area of the body on the face.  x+- are the centroids of the material
+in both cells, and d+- their distances from the face.  `layers` defines kappa and d of mixed cells.  Distances from
+centroids give an error of 0.2 % for any filling; half of the cell size as distance would give up to 12 %.
+`nonorthogonal` corrects faces between centroids that are offset along the face.  The sum over all cells is the bodies'
+balance.  `fluid_content` defines the change of the content, and `time_integration` the integral over a substep.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
 other cells, and pressure jumps are damped (see below).  Points carry the difference, a volume defect (`owed`).  The
@@ -22,11 +22,11 @@ next steps correct fractions of it (`defect`), at a constant rate over the step.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term max(0, tau d - dt kappa / d) A [p - p_n], with d = d+ + d- and the weight dt, s, of the rate at p.  This raises the
-coefficient dt kappa A / d of a face to tau d A if it is smaller.  The stabilisation is conservative, and vanishes in
-steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja
-2021).  Soil in plastic flow needs up to a hundred times more.  The additional damping acts on second differences only
-(`second_differences`), because damping of jumps would smear steep pressures.
+term max(0, tau d - dt kappa / d) A [p - p_n].  Here d = d+ + d-, and dt, s, is the weight of the rate at p in the step.
+This raises the coefficient dt kappa A / d of a face to tau d A if the coefficient is smaller.  The stabilisation is
+conservative, and vanishes in steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value
+(Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau
+acts on second differences only (`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class StorageForms:
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
         Whether to use alpha as the derivative of the content by J_Delta, so that the Jacobian is symmetric.  The
-        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast.
+        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast as with it.
     feeding
         Sources and open sides of all stages.
     inertial : (d,), N/m^3
@@ -125,7 +125,7 @@ class StorageForms:
         retentions, laws = materials.retentions, materials.conductivity_laws
         Q = self.p.function_space
         self.conductivity = None
-        """Conductivity laws, None without any."""
+        """Evaluation of the conductivity laws; None if there are none."""
         if laws:
             self.conductivity = ConductivityAtPieces(materials.materials, laws, pieces, displacement, self.p_before)
         self._work = fem.Function(Q)
@@ -169,8 +169,8 @@ class StorageForms:
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
         """Return the derivatives of `change` by pressure (filled cells,), m^d/Pa, and by nodal displacements.
 
-        The derivatives by displacements (filled cells, n), m^(d-1), are first derivatives of alpha dJ_Delta, for the
-        momentum balance; then derivatives of the content, if they differ.
+        The derivatives by displacements are one or two arrays (filled cells, n), m^(d-1).  The first, for the momentum
+        balance, differentiates alpha dJ_Delta; the second, if it differs, differentiates the content.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
@@ -183,7 +183,7 @@ class StorageForms:
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow of active cells to other cells, m^d/s, as a local array, from p and the fluid's weight.
+        """Return the outflow of active cells to other cells (c,), m^d/s, caused by p and by the fluid's weight.
 
         `force` (c, d), N/m^3, is the inertia force on the fluid in the local cells, or None.
         """
@@ -273,12 +273,12 @@ class StorageSystem:
         return form and form.on(self._facets if relative is None else relative.uniform(self._facets))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return grid positions of this process's unknowns; the array of fixed positions is empty."""
+        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is fixed."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change of the residual by displacements u, m^d: of content and, with `slopes`, of fluxes."""
+        """Set `out` to the residual's change, m^d, by displacements u: of the content and, with `slopes`, of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -317,7 +317,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of fluxes between cells, at p if unsaturated.  For `force` see `StorageForms.driven`."""
+        """Assemble the flux matrix between cells; of unsaturated soil at p.  `force`: see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -334,7 +334,7 @@ class StorageResidual:
     """Residual of the fluid balance of each cell, m^d, and its scales in each connected part (parts,), m^d."""
 
     vector: PETSc.Vec
-    exchanged: NDArray[np.float64]  # sum of all absolute changes
+    exchanged: NDArray[np.float64]  # sum of absolute changes of content and of sources
     round_off: NDArray[np.float64]  # bound of rounding errors
     off: NDArray[np.float64]  # sum of absolute mass errors of the cells
     gain: NDArray[np.float64]  # change of content plus outflow minus sources
@@ -355,15 +355,15 @@ class StorageProblem:
     feeds
         Sources and open sides.
     flow
-        Function that assembles the outflow at (u, p).  The argument tells whether a substep starts.
+        Function that assembles the outflow at (u, p); its argument tells whether a substep starts.
     dt
         Weight of the rate at (u, p), s.
     before
         Outflow volumes from the rate of the previous substep.
     softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`, if the soil may soften.
+        Softness of the pieces, see `SoftnessAtPoints`, if a law may yield.
     defect : (n,), m^d
-        Part of the volume defect in the active owned cells to be corrected until the end of the substep.
+        Part of the volume defect in the active owned cells that is corrected by the end of the substep.
     inertial
         Function that returns the inertia forces on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
     scale
@@ -419,7 +419,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in cells of softness (n,); tau (n,), 1/Pa: that of elastic soil."""
+        """Return the matrix of additional damping in cells of softness (n,); tau (n,), 1/Pa, is for elastic soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -469,7 +469,7 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, by which its pressure is weighted."""
+        """Volume fraction of material in each cell, by which the cell's pressure is weighted."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -477,7 +477,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content caused by pressure errors (n,), Pa, and its changes (n,) in the step."""
+        """Return errors of the water content by pressure errors (n,), Pa, and changes of the content in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -533,10 +533,10 @@ class StorageProblem:
         self._flow(False)
 
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
-        """Return a function from a vector of displacements, m, to changes of outflow volumes (n,), m^d, along it.
+        """Return a function from changes of displacements (a vector), m, to changes of outflow volumes (n,), m^d.
 
-        It uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the geometry of
-        the fluxes.  `set_fluxes` resets the fluxes to u.  `dofs` are the active degrees of freedom of u.
+        The function uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
+        geometry of the fluxes.  `set_fluxes` resets the fluxes to u.  `dofs` are the active degrees of freedom of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -615,7 +615,7 @@ class StorageProblem:
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for `data` in place of its pieces.
+        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for its pieces or for `data`.
 
         `of_suction` are cells (c,) and derivatives of their nodal forces (c, n) by p, m^(d-1), if a law depends on
         suction.
@@ -652,8 +652,8 @@ class StorageProblem:
             Multiple of beta, >= 0.
         share
             Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
-            pressure, beta V / 2 (at nu = 0) for one that alternates along one axis, and zero for a checkerboard.
-            beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
+            pressure, and zero for a checkerboard.  For a pressure that alternates along one axis, it is beta V / 2 (at
+            nu = 0). beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

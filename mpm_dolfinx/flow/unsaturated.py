@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in unsaturated soil: conductivities of faces from the pressures on both sides.
 
-The relative conductivity k_r of a face is the mean of k_r over the pressures between both sides
+The relative conductivity k_r of a face is the mean of k_r over all pressures between the values on both sides
 (`retention.Conductance`).  With the value of the wetter side, a wetting front would move too fast.  With gravity the
 mean is modified (`fitted`), so that steady flow through exponential soil is exact.  See `series` for mixed cells.
 """
@@ -96,7 +96,7 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """Relative conductivities as functions of pressure, by number of the retention curve; 0 for saturated soil."""
+    """Relative conductivities as functions of pressure, by index of the retention curve; index 0 is saturated soil."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]
@@ -130,7 +130,7 @@ class Relative:
     Attributes
     ----------
     shares
-        DG0: fractions of the mobility of a cell at k_r = 1 from soil without a retention curve, and from each curve.
+        DG0: fractions of a cell's mobility at k_r = 1: of soil without a retention curve, and of soil with each curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -189,7 +189,7 @@ class Relative:
         """Return k_r (m,) along normals (m, d), between pressures p of owned cells and outside pressures (m,), Pa.
 
         Also return the derivative by p of k_r times the potential difference.  `drop` (m,), Pa, is the pressure drop
-        out of the cell caused by the weight of the fluid.
+        from the centroid to the face caused by the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

@@ -12,7 +12,7 @@ def block(T):
 
 
 def planar(F) -> bool:
-    """Return whether the third axis of a UFL deformation gradient is principal: its shape is (2, 2), or a `block`."""
+    """Return whether the third axis of a UFL deformation gradient is principal: it is (2, 2), or a `block`."""
     if isinstance(F, ufl.classes.Variable):
         F = F.ufl_operands[0]
     if F.ufl_shape == (2, 2):

@@ -75,14 +75,14 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add `rows` (cells, n) to `A`, without final assembly; `A` has a row per cell, a column per dof of Q1 vectors."""
+    """Add `rows` (cells, n) to `A`, without final assembly; `A` has a row for each cell, a column for each Q1 dof."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return rows and columns of the stored entries of a matrix, and the index of each entry among these."""
+    """Return rows and columns of the stored entries of a matrix, and each matrix entry's index among these."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -127,7 +127,7 @@ class ElementMatrices:
 
     Inserting a matrix for every point costs twice as much as computing it.  The entries of the element matrix are A
     contracted with the gradients of the shape functions at the point.  Through DG0 test functions, the assembler sums
-    these entries over the points of a cell.  Each cell is then inserted once.
+    these entries over the points of a cell.  Each element matrix is then inserted once.
 
     Parameters
     ----------
@@ -168,8 +168,7 @@ class ElementMatrices:
 def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
     """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
-    `tangent` (3, 3, 3, 3) is that of `ElementMatrices`.  `row` and `column` are node and axis of the displacements v,
-    u.
+    `tangent` (3, 3, 3, 3): see `ElementMatrices`.  `row` is node and axis of v, `column` is node and axis of u.
     """
     (v, i) = row
     (u, j) = column

@@ -2,7 +2,7 @@
 """The unknowns of a step: their numbering, vectors and matrices.
 
 Functions are defined on the whole grid.  Vectors, matrices and factors contain only the free degrees of freedom of
-active nodes or cells.  In the local-to-global map all other degrees of freedom have the number -1, which PETSc ignores.
+active nodes or cells.  In the local-to-global map all other degrees of freedom have the index -1, which PETSc ignores.
 dolfinx can therefore assemble directly into these vectors and matrices.
 """
 
@@ -28,7 +28,7 @@ class Unknowns:
     dofs
         Unrolled local degrees of freedom that are unknowns, ghosts included.
     x : (entities, d), m
-        Positions of the nodes or cells of this process.  If None, the space computes all of them at each request.
+        Positions of the nodes or cells of this process.  With None, the space computes all positions at each request.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
@@ -118,7 +118,7 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has released on all processes; all processes must call this function.
 
     On several processes PETSc keeps released objects, because the order of release may differ between processes.
-    Releases of PETSc before 3.20 or so also keep the objects of a single process.  Without this call a run keeps the
+    Versions of PETSc before 3.20 or so also keep the objects of a single process.  Without this call a run keeps the
     matrices of all its steps.
     """
     PETSc.garbage_cleanup(comm)

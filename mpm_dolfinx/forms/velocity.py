@@ -34,6 +34,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set `own`, s, and at the active dofs the field `past` to the argument `past` times the current u."""
+        """Set `own`, s; set the field `past` at the active dofs to the argument `past` times the current u."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

@@ -32,7 +32,7 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
     else:
         raise ValueError(f"grid: follow = {line(follow)}, must be a Tool, or a function of t, x or both")
     if lines is None:
-        raise ValueError("grid: follow: must be given with lines, whose numbers of cells stay")
+        raise ValueError("grid: follow without lines, must be given with lines; their numbers stay constant")
 
 
 def lines_at(
@@ -40,7 +40,7 @@ def lines_at(
 ) -> list[NDArray[np.float64]]:
     """Return the lines (n,), m, along each axis, from a function of time t (s) and positions x (n, d), m.
 
-    `given` are the true lines of the grid.  The new lines must have the same numbers and the same ends.
+    `given` are the lines with which the grid was created.  The new lines must have the same numbers and the same ends.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -59,13 +59,13 @@ def lines_at(
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return lines (n,), m, along each axis after the smallest cells have moved by a displacement `shift` (d,), m.
 
-    Edges between the smallest cells and a side are multiplied by the powers 1, 2 ... of a common factor, counted from
-    the smallest cells.  They therefore grow from there as before, but faster or slower.
+    Edge lengths between the smallest cells and a side are multiplied by powers 1, 2 ... of a common factor, counted
+    from the smallest cells.  Cells therefore still grow with the distance from the smallest ones, but faster or slower.
 
     Raises
     ------
     ValueError
-        Smallest cells that touch a side and move along its normal; cells that would become smaller than the smallest.
+        The smallest cells touch a side and move along its normal, or other cells would become smaller than these.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):
@@ -85,18 +85,18 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
 
 
 def _filled(width: NDArray[np.float64], length: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
-    """Return edges (n,), m, from the smallest cells to a side, after the distance grows by `more`, m.
+    """Return edge lengths (n,), m, between the smallest cells and a side, after this distance has grown by `more`, m.
 
-    `width` are the edges before, `length` the distance before, `least` the smallest edge, m.
+    `width` are the edge lengths before, `length` the distance before, `least` the smallest edge length, m.
     """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):
-        raise ValueError(f"{what}, but its cells begin at a side: lines must have larger cells on both sides")
+        raise ValueError(f"{what}, but the small cells begin at a side: lines must have larger cells on both sides")
     power = np.arange(1, len(width) + 1)
     total = length + more
     if total < len(width) * least * (1 - SAME):
-        allowed = f"must stay {len(width) * least:.3g} m away for {len(width)} cells, none smaller than its own"
-        raise ValueError(f"{what}, its cells are {total:.3g} m from a side, {allowed}")
+        allowed = f"must be at least {len(width) * least:.3g} m for the {len(width)} cells between them"
+        raise ValueError(f"{what}: the small cells are {total:.3g} m from a side, {allowed}")
 
     def beyond(factor: float) -> float:
         return float((width * factor**power).sum() - total)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-Points are located in equal cells by arithmetic, in other grids by a search along each axis.  Methods such as `sizes`
-and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
+In grids of equal cells, points are located by arithmetic, in other grids by a search along each axis.  Methods such as
+`sizes` and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
 
 The mesh is created at its first use.  By then a simulation has distributed the cells by the number of points in them.
 """
@@ -26,22 +26,42 @@ from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
 from mpm_dolfinx.grid.partition import destinations, owners
+from mpm_dolfinx.parallel.exchange import Exchange
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Axis and end of each side of a box: (axis, 0 for the lower or 1 for the upper end)."""
-REACH = 1e-4  # cells: bodies may lie outside the grid by this distance, because a penalty holds them at walls inexactly
+REACH = 1e-4  # (distance / cell size) by which bodies may lie outside the grid: penalties hold them at walls inexactly
 
 TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
 """Number of rows that are processed together, which limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Distance to a grid plane, in cells, below which a vertex lies on the plane, unless rounding errors are larger."""
+"""(Distance to a grid plane) / (cell size) below which a vertex is on the plane, unless rounding errors are larger."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
+
+
+def corner_bits(dim: int) -> NDArray[np.int64]:
+    """Return the ends (2^d, d) of the corners of a box along each axis: 0 lower, 1 upper."""
+    return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
+
+
+def _faces(dim: int) -> NDArray[np.int64]:
+    """Return the indices (2d, 2^(d-1)) of the corners of a box's faces; face 2 a + e is at end e of axis a."""
+    bits = corner_bits(dim)
+    return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
+
+
+FACES = {d: _faces(d) for d in (2, 3)}
+"""Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
+FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
+"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
+ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
+"""Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -66,7 +86,7 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all numbers (n,) of m ranges, given by first number and count, and the range of each number (n,)."""
+    """Return, for each integer in m ranges given by `first` and `count` (m,): its range (n,), and the integer (n,)."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -79,7 +99,7 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return the edges normal to a face of its "+" and "-" cells, and their mean, m, as UFL; n is the face normal."""
+    """Return the edge lengths, m, of the "+" and "-" cells along the normal n of a face, and their mean, as UFL."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -92,7 +112,7 @@ class CellPlaces(NamedTuple):
 
     node_x: NDArray[np.float64]  # nodes (nodes, d), m
     midpoints: NDArray[np.float64]  # midpoints of cells (cells, d), m
-    sizes: NDArray[np.float64] | None  # edges of cells (cells, d), m; None for equal cells
+    sizes: NDArray[np.float64] | None  # edge lengths of cells (cells, d), m; None for equal cells
 
 
 class Spacing(NamedTuple):
@@ -116,7 +136,7 @@ class Cells:
     at
         Current positions.
     cell_number, locals, owners
-        Lexicographic number of each local cell; local index of each cell, or -1; rank of each cell, copy by copy.
+        Lexicographic index of each local cell; for all cells, copy by copy: local index, or -1, and owner rank.
     cell_facets, facet_cells
         Facets of each cell (cells, 2d); cells at each facet (facets, 2), -1 outside the boundary.
     """
@@ -161,7 +181,7 @@ class Cells:
 
     @cached_property
     def edges(self) -> fem.Function:
-        """Edges of the cells, m, for forms on cells of several sizes."""
+        """Edge lengths of the cells, m, for forms on cells of several sizes."""
         out = fem.Function(self.cellwise((self.at.sizes.shape[1],)))
         out.x.array[:] = self.at.sizes.ravel()
         return out
@@ -211,9 +231,9 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the tool, and the cells around them widen or narrow.  A function of time t (s) and positions x (n, d) of all
-        points (parameters t, x or both) returns the same number of lines, between the same sides.  A tool must be a
-        condition of the first stage; lines stay in stages without it.
+        the tool, and the cells around them widen or narrow.  A function of time t (s), of the positions x (n, d) of all
+        points, or of both returns the same number of lines between the same sides.  A tool must be a condition of the
+        first stage; lines do not move in stages without the tool.
     axisymmetric
         Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
         forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
@@ -222,23 +242,23 @@ class Grid:
     Raises
     ------
     ValueError
-        Corners or lines are not finite or not ascending; numbers of cells are not integers >= 1; PETSc cannot number
-        the nodes; an axisymmetric grid is in 3D or has r < 0; `follow` is given without lines.
+        Corners or lines are not finite or not ascending.  Numbers of cells are not integers >= 1.  There are too many
+        nodes for PETSc.  An axisymmetric grid is in 3D or has r < 0.  `follow` is given without lines.
 
     Attributes
     ----------
     dim, shape, lower, upper
-        d; number of cells along each axis (d,); corners (d,), m.
+        Dimension d; number of cells along each axis (d,); corners (d,), m.
     even, lines, widths
-        Whether all cells are equal; current lines (n,) along each axis, relative to `base`, m; edges (n - 1,) along
-        each axis, m.
+        Whether all cells are equal; current lines (n,) along each axis, relative to `base`, m; edge lengths (n - 1,)
+        along each axis, m.
     finest, least, most
         Shortest edge along each axis (d,), m; shortest and longest edge of all cells, m.
     snap
-        Distance to a grid plane along each axis (d,), in cells, below which a vertex lies on the plane.
+        (Distance to a grid plane) / (cell size) along each axis (d,), below which a vertex lies on the plane.
     base, low, high
-        Origin (d,), m, of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  It preserves
-        digits of positions far from the true origin.  Lower and upper corner relative to `base`.
+        Origin (d,), m, of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin
+        preserves digits of positions far from the true origin.  Lower and upper corner relative to `base`.
     stretches
         Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
     mesh
@@ -263,7 +283,7 @@ class Grid:
             check_follow(follow, lines)
         if not self.even:
             if any(value is not None for value in (lower, upper, cells)):
-                raise ValueError("grid: lines are given, lower, upper and cells must not be")
+                raise ValueError("grid: lines together with lower, upper or cells, must be given without these")
             lines = checked(lines)
             self.even = all(map(equal, lines)) and follow is None
             lower, upper, cells = ([of(x) for x in lines] for of in (np.min, np.max, lambda x: len(x) - 1))
@@ -300,7 +320,7 @@ class Grid:
         return tuple(x - start for x, start in zip(lines, self.base, strict=True))
 
     def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
-        """Return the spacing for lines relative to the base, or for equal cells if None."""
+        """Return the spacing of the grid.  `lines` are positions relative to the base; None: equal cells."""
         finest, most = self._h, self._h
         if lines is None:
             lines = tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self._h, strict=True))
@@ -311,9 +331,9 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
-        """Move the lines of a grid that follows to new coordinates (n,), m, along each axis, relative to the base.
+        """Move the lines of a grid with `follow` to new coordinates (n,), m, along each axis, relative to the base.
 
-        Afterwards all positions equal the positions in a new grid with these lines, for any earlier lines.
+        Afterwards all positions equal the positions in a new grid with these lines, and do not depend on earlier lines.
         """
         if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
             self._spacing = self._spaced(tuple(lines))
@@ -325,7 +345,7 @@ class Grid:
 
     @property
     def h(self) -> NDArray[np.float64]:
-        """Edges (d,), m, of equal cells."""
+        """Edge lengths (d,), m, of equal cells."""
         if self._h is None:
             raise ValueError(MANY)
         return self._h
@@ -336,11 +356,11 @@ class Grid:
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of local cells; one row (d,) for equal cells."""
+        """Return the edge lengths (n, d), m, of local cells; one row (d,) for equal cells."""
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edges (n,), m, of local cells (n,) along one axis, or along a different axis for each cell."""
+        """Return the edge lengths (n,), m, of local cells (n,) along one axis, or along an axis for each cell."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
@@ -356,19 +376,19 @@ class Grid:
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of cells with lexicographic numbers (n,); one row (d,) for equal cells."""
+        """Return the edge lengths (n, d), m, of cells with lexicographic indices (n,); one row (d,) for equal cells."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edges (..., d), m, of cells at positions x (..., d), m, from the base; (d,) for equal cells."""
+        """Return the edge lengths (..., d), m, of cells at x (..., d), m, from the base; one row for equal cells."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions (..., d) in units of cells from the lower corner, for positions x in m from the base."""
+        """Return cell index + fraction of the cell along each axis (..., d), for x (..., d), m, from the base."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -378,7 +398,7 @@ class Grid:
         return out
 
     def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return distances (..., d) >= 0 along the axes, in units of cells, between positions x and y from the base."""
+        """Return distances (..., d) >= 0 along the axes between x and y, divided by the cell size, see `in_cells`."""
         if self.even:
             return np.abs((y - x) / self._h)
         return np.abs(self.in_cells(y) - self.in_cells(x))
@@ -398,7 +418,7 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Return the edges (d,), m, of the cell as a UFL coefficient; a constant for equal cells."""
+        """Return the edge lengths (d,), m, of the cell as a UFL coefficient; a constant for equal cells."""
         return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -406,7 +426,7 @@ class Grid:
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of cells with indices (n, d) along the axes; one row (d,) for equal cells."""
+        """Return the edge lengths (n, d), m, of cells with indices (n, d) along the axes; one row for equal cells."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
@@ -452,7 +472,7 @@ class Grid:
         load : (cells,)
             Load of each cell, such as its number of points, >= 0.
         keep
-            Keep an existing mesh for any distribution, because other objects were created on this mesh.
+            Whether to keep an existing mesh for any distribution, because other objects were created on this mesh.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -474,8 +494,8 @@ class Grid:
         return Cells(self, mesh, np.tile(owner.ravel(), self.copies))
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic numbers (n, 2^d) of the nodes of cells."""
-        bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
+        """Return the lexicographic indices (n, 2^d) of the nodes of cells."""
+        bits = corner_bits(self.dim)
         index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
         return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
@@ -502,7 +522,7 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return, for material points with these ids (n,), the number of the first cell of their copy of the box."""
+        """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
@@ -535,7 +555,7 @@ class Grid:
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic numbers (n,), in the first copy, of cells with indices (n, d) along the axes."""
+        """Return the lexicographic indices (n,), in the first copy, of cells with indices (n, d) along the axes."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -550,22 +570,30 @@ class Grid:
         return np.minimum(np.maximum(i, 0), self.shape - 1, out=i)
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the rank that owns each cell with a lexicographic number."""
+        """Return the owner rank of the cells with lexicographic indices `number`."""
         return self.owners[number]
 
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the local index of each cell with a lexicographic number; -1 for cells of other processes."""
+        """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
         return self.locals[number]
 
+    def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
+        """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
+        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
+        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+        travel = Exchange(self.comm, self.owner(parts[0]))
+        cell, x, values = map(travel.send, parts)
+        return self.local(cell), x, values
+
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes and the number of the copy (n, d + 1) of local nodes (n,)."""
+        """Return the indices along the axes and the index of the copy (n, d + 1) of local nodes (n,)."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes and the number of the copy (n, d + 1) of local cells (n,)."""
+        """Return the indices along the axes and the index of the copy (n, d + 1) of local cells (n,)."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
 
@@ -580,7 +608,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which positions x from the base lie outside the grid by more than `tolerance` cells plus rounding."""
+        """Return which x (from the base) are outside the grid by more than `tolerance` cell sizes plus rounding."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
@@ -613,16 +641,16 @@ class Grid:
         """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell; one column for each function.
 
         Row s is the factor of the product of the offsets along all axes whose bit is set in s.  For unequal cells, the
-        offsets are in units of the edges, see `over_edges`.
+        offsets are divided by the edge lengths, see `over_edges`.
         """
-        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        bits = corner_bits(self.dim)[:, None]
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
         """Convert coefficients (d, 2^d, cells) of `monomials` to offsets in m; for equal cells they are unchanged."""
         if self.even:
             return coefficients
-        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        bits = corner_bits(self.dim)[:, None]
         return coefficients / np.where(bits, self.sizes(cells), 1.0).prod(axis=2)
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -643,7 +671,7 @@ class Grid:
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets of this process between two active cells.  `cells` are the active cells."""
+        """Return the facets of this process between two active cells.  `cells` are the indices of `active` cells."""
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
         both = self.facet_cells[facets]
@@ -683,5 +711,5 @@ class GridOfGroups(Grid):
         return self._copies
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return, for material points with these ids (n,), the number of the first cell of their copy of the box."""
+        """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
         return self._group[ids] * np.int64(self.cells)

@@ -53,7 +53,7 @@ def graded(
 ) -> list[NDArray[np.float64]]:
     """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance.
 
-    Lines cross the whole grid.  Cells beside a fine box, along an axis, are therefore as narrow as the cells inside.
+    Lines cross the whole grid, so cells in the rows and columns of a fine box are as narrow as the cells in the box.
 
     Parameters
     ----------
@@ -62,11 +62,11 @@ def graded(
     fine : (boxes, 2, d), m
         Lower and upper corners of the fine boxes, at least one box, inside the grid.
     size : number or (d,), m
-        Largest edges of the small cells, > 0.  Each box contains a whole number of cells.
+        Largest edge lengths of the small cells, > 0.  Each box contains a whole number of cells.
     ratio
-        Largest ratio of neighbouring edges, > 1; it is exceeded if there is not enough space.
+        Largest ratio of edge lengths of neighbouring cells, > 1; it is exceeded if there is not enough space.
     largest : m
-        Largest edge of a cell, >= size.
+        Largest edge length of a cell, >= size.
 
     Returns
     -------
@@ -131,9 +131,9 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edges (n,), m, that fill a gap, m, with a common growth factor of at most `ratio`, starting near `size`.
+    """Return edge lengths (n,), m, that fill a gap, m, and grow from `size` by a common factor, if possible <= `ratio`.
 
-    Two numbers of edges are possible; the one with the growth factor nearest to 1 is used.
+    Two counts of edges are tried; the count whose growth factor is nearer to 1 is used.
     """
     if gap <= 0:
         return np.empty(0)

@@ -33,7 +33,7 @@ def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Distribute a box of cells among `count` ranks, starting at rank `first`.  Arrays are views of the whole grid's.
+    """Distribute a box of cells among `count` ranks from rank `first` on.  Arrays are views of the whole grid's arrays.
 
     If there are enough cells, each rank gets at least one; this has priority over equal loads.
     """
@@ -64,7 +64,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the ranks that hold each of some cells, the owner first, and the offset of each cell's list of ranks.
+    """Return the list of ranks that hold the cells, for each cell the owner first; and each cell's start in this list.
 
     Processes that own a neighbour across a face hold the cell as a ghost.
 
@@ -73,7 +73,7 @@ def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[ND
     owner
         Owner rank of each cell, with the shape of the grid.
     cells : (n,)
-        Lexicographic numbers of the cells.
+        Lexicographic indices of the cells.
     """
     index, shape = np.array(np.unravel_index(cells, owner.shape)), np.array(owner.shape)[:, None]
     ranks = [owner.ravel()[cells]]

@@ -30,13 +30,12 @@ from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
-from mpm_dolfinx.stepping.state import State, Stay, Trend
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import State, Stay, StepControl, Trend
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 13  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
-LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if domains will be cut again
+LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
 NODAL = ("velocity", "held", "rest")  # nodal fields of a State
 # metadata of a checkpoint, with their types
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}
@@ -117,7 +116,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ----------
     simulation
         The scene of the checkpoint, on any number of processes.  First call `stage`, to bring the scene to the stage of
-        the checkpoint.  Grid, bodies, materials with their fields and laws, and fluid must agree with the file.  Loads,
+        the checkpoint.  Grid, bodies, materials with their fields and laws, and fluid must be as in the file.  Loads,
         boundary conditions, terms and sources may differ.  Data that observers have collected are not in the file.
     file
         The checkpoint.
@@ -301,13 +300,13 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
 
 
 def _nodes(grid: Grid) -> NDArray[np.int64]:
-    """Return the lexicographic numbers of the nodes of this process."""
+    """Return the lexicographic indices of the nodes of this process."""
     *index, copy = grid.node_places(np.arange(len(grid.node_x))).T
     return np.ravel_multi_index(tuple(index), tuple(grid.shape + 1)) + copy * grid.nodes
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return, on rank 0, numbers and values of all nodes with non-zero values; an empty dictionary for None."""
+    """Return, on rank 0, indices and values of all nodes with non-zero values; an empty dictionary for None."""
     if nodal is None:
         return {}
     nodal = nodal.reshape(-1, grid.dim)
@@ -347,7 +346,7 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
     if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
         raise ValueError(f"{name}: not nodal values on the grid, or not finite")
     if len(node) and not 0 <= node[0] <= node[-1] < grid.copies * grid.nodes:
-        raise ValueError(f"{name}: node numbers out of range of the grid")
+        raise ValueError(f"{name}: node indices out of range of the grid")
     arrays |= {"node": node, "values": values}
 
 
@@ -430,5 +429,5 @@ def _check_scene(file: Path, stored: dict[str, Any], present: dict[str, Any]) ->
     """Raise ValueError if the checkpoint belongs to another scene."""
     for name in {**stored, **present}:
         if stored.get(name) != present.get(name):
-            both = f"{stored.get(name)} there, {present.get(name)} here, must agree"
+            both = f"{stored.get(name)} in file, {present.get(name)} here, must be equal"
             raise ValueError(f"{file}: checkpoint of another scene: {name}: {both}")

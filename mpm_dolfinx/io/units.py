@@ -5,7 +5,7 @@ from __future__ import annotations
 
 FIELDS = {
     "points.pvd: the domains of the material points": {
-        "id, material": "number of the point; index of its material",
+        "id, material": "identifier of the point; index of its material",
         "displacement": "m, since the start, or since the last reset by a stage",
         "F, J": "-, deformation gradient, by components F_xy in plane strain; its determinant, the volume ratio",
         "pressure": "Pa, pore pressure, positive in compression",
@@ -21,7 +21,7 @@ FIELDS = {
         "others": "state of the law (see its documentation), constants that vary in space, data of the user",
     },
     "tools.pvd: the parts of the grid's cells inside the tools": {
-        "tool": "number of the tool",
+        "tool": "index of the tool",
         "force": "N, in plane strain N/m, on the bodies",
     },
     "grid.pvd: the cells of the grid": {
@@ -31,8 +31,8 @@ FIELDS = {
     },
     "history.csv: one row for each output time": {
         "t, wall": "s, time in the scene; wall time so far",
-        "steps, newton, coupling, cuts, rederived": "steps, Newton, coupling iterations, shortened steps, new domains",
-        "balance, residual": "-, largest relative error so far of the fluid balance, and of the two problems",
+        "steps, newton, coupling, cuts, rederived": "steps, Newton, coupling iterations, reduced steps, reset domains",
+        "balance, residual": "-, largest relative error so far: of the fluid balance; of the equations",
         "p_min, p_max": "Pa, smallest and largest pore pressure of the material points",
         "x_0, y_0, z_0": "m, current position of probe 0; likewise for the other probes",
         "ux_0, uy_0, uz_0": "m, displacement of probe 0",
@@ -41,7 +41,7 @@ FIELDS = {
         "reaction_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the prescribed displacement NAME on the bodies",
         "wall_reaction_x_WALL, _y_, _z_": "N, in plane strain N/m, force of a wall of the grid on the bodies",
         "tool_force_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the tool or contact NAME on the bodies",
-        "tool_force_moment_NAME": "N, in plane strain moment about its centre per metre; in 3D _x, _y, _z, N m",
+        "tool_force_moment_NAME": "N m, in plane strain N, moment about the tool's centre; in 3D _x, _y, _z",
         "tool_travel_NAME": "m, displacement of the tool NAME under its load; of a free tool _x, _y, _z",
         "tool_velocity_x_NAME, _y_, _z_": "m/s, velocity of the free tool NAME",
         "tool_rotation_NAME": "rad, counterclockwise rotation of the free tool NAME, in 2D",

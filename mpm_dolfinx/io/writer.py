@@ -77,8 +77,8 @@ class Writer:
     Raises
     ------
     ValueError
-        An argument of the wrong type.  Files in the folder that no writer has written, or with other columns.  A run of
-        another simulation, or one that starts at another time.  A closed writer.
+        An argument has the wrong type.  Files in the folder were not written by a writer, or have other columns.  The
+        run is of another simulation, or starts at another time.  The writer is closed.
     OSError
         The folder is not writable, or the disk is full.  To continue: `simulation.run(..., after=simulation.result)`.
     """
@@ -112,7 +112,7 @@ class Writer:
         self.close()
 
     def close(self) -> None:
-        """Release the lock of the folder.  All files are complete.  A second call has no effect."""
+        """Release the lock of the folder.  All files are already complete.  A second call has no effect."""
         self._lock, self.closed = None, True
 
     def _hold(self, folder: Path) -> None:
@@ -194,7 +194,7 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write the parts of the grid cells inside the tools, with number and force of each tool."""
+    """Write the parts of the grid cells inside the tools, with index and force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
     corners = [
         tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
@@ -206,7 +206,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """An exclusive lock of a folder.  It ends when the last writer of this process releases it."""
+    """An exclusive lock of a folder.  The lock ends when the last writer of this process releases it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
@@ -269,7 +269,7 @@ def _padded(vectors: NDArray) -> NDArray:
 
 
 def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
-    """Yield the names and values of the fields in which VTK displays scalars, vectors or tensors (n, ...)."""
+    """Yield names and values of the fields in VTK's form, for a field of scalars, vectors or tensors (n, ...)."""
     if rows.shape[1:] == (2, 2):  # not padded to 3 x 3, because the out-of-plane components are unknown
         for i, j in np.ndindex(2, 2):
             yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
@@ -304,7 +304,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 
 @contextmanager
 def _true_places(grid: Grid) -> Iterator[None]:
-    """Shift the mesh of a grid to the true positions of its nodes, within this context."""
+    """Context manager that shifts the mesh of a grid to the true positions of its nodes."""
     x = grid.mesh.geometry.x
     own = x.copy()
     x[:, : grid.dim] += grid.base
@@ -340,11 +340,11 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Raise ValueError for a file that no `Writer` has written, within this context."""
+    """Context manager that turns errors while a file is read into a ValueError: no `Writer` wrote the file."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or use another folder") from error
+        raise ValueError(f"{file}: no Writer's file ({line_of(error)}), must be one, or use another folder") from error
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
@@ -447,8 +447,8 @@ class Table:
     def _check(self, row: dict[str, float]) -> None:
         row_names, known = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
         if row_names != known:
-            both = f"{', '.join(known)}, the run's {', '.join(row_names)}"
-            raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
+            both = f"{', '.join(known)}, the columns of the run {', '.join(row_names)}"
+            raise ValueError(f"{self.file}: its columns are {both}; must be equal, or use another folder")
 
     def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:
         with open(file, mode, newline="") as f:

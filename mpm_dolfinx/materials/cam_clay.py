@@ -8,8 +8,8 @@ elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(ta
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
 and flow is associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  The stress at the end of a
-step follows implicitly from the trial stresses P_t and Q_t.  With w = (Q_t / (M P_t))^2, plastic compaction kappa a and
-the plastic multiplier dgamma from 6G dgamma / M^2 = exp(h) - 1:
+step follows implicitly from the trial stresses P_t and Q_t.  The plastic compaction is kappa a.  The plastic multiplier
+dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
@@ -62,7 +62,7 @@ class _FollowsByPlace:
     follows: ClassVar[bool] = True
 
     def __call__(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the bulk moduli (m,), Pa, at reference positions X (m, d), m."""
+        """Return the bulk moduli (n,), Pa, at reference positions X (n, d), m."""
         at = [f(X) if callable(f) else np.asarray(f) for f in (self.stress, self.kappa)]
         return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
 
@@ -76,13 +76,13 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes lambda* and kappa* of ln v against ln P in first loading and unloading, -, 0 < kappa < lambda_.  P is a
+        Slopes of ln v against ln P, -, 0 < kappa < lambda_: lambda_ in first loading, kappa in unloading.  P is a
         Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C / (v - C).
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive, mean < 0.  The last one is out of plane in 2D, and
         circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: initial size of the yield surface / size at which it contains the stress.
+        Overconsolidation ratio, -, >= 1: initial P_c / P_c of the yield surface through the initial stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
@@ -242,14 +242,14 @@ class BarcelonaBasic(ModifiedCamClay):
     This is the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  At constant
     suction the law is Modified Cam Clay with lambda(s), and in saturated soil with lambda(0).  Bishop's stress alone
     determines the strength due to suction and the swelling on wetting.  The suction is evaluated at the end of a
-    substep.  Suction has no effect once P_c0 is below P_r.
+    substep.  Suction has no effect on the yield surface if P_c0 is below P_r.
 
     Parameters
     ----------
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c / size at which the yield surface contains the initial stress.
+        Overconsolidation ratio, -, >= 1: initial P_c / P_c of the yield surface through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r
@@ -257,11 +257,11 @@ class BarcelonaBasic(ModifiedCamClay):
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, below which P_c0 is independent of suction; usually 0.01 to 0.5 times the initial P_c0.
+        Stress P_r, Pa, > 0; if P_c0 < P_r, P_c does not depend on suction.  Usually 0.01 to 0.5 times the initial P_c0.
 
     Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  The state is that of Modified
-    Cam Clay, with ln(P_c0 / initial P_c0) as `consolidated`, and `suction`, Pa.  Source: Alonso, Gens and Josa (1990);
-    in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+    Cam Clay, with ln(P_c0 / initial P_c0) as `consolidated`, `suction` and `suction_at_start`, Pa.  Source: Alonso,
+    Gens and Josa (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------

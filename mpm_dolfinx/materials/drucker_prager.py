@@ -55,9 +55,9 @@ class DruckerPrager(Frictional):
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa.  kappa is the accumulated plastic strain (work
         conjugate to c, if flow is associated).
     match
-        Stress states in which the cone agrees with Mohr and Coulomb's surface: "plane strain" (equal collapse load,
-        exact for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In
-        axisymmetry no cone agrees everywhere: a circular footing on von Mises's soil bears 10 % less than on Tresca's.
+        Stress states in which the cone coincides with Mohr and Coulomb's: "plane strain" (equal collapse load, exact
+        for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In axisymmetry
+        no cone coincides everywhere: a circular footing on von Mises's soil bears 10 % less than on Tresca's.
 
     Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `hardened`, kappa, in
     `points.data`.  Source: de Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
@@ -133,8 +133,8 @@ def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, 
 
     Returns
     -------
-    p: pressure, Pa; ratio: deviatoric stress / its trial value; yields: whether the trial stress is outside the yield
-    surface; apex: 1 for a return to the apex, else 0; hardened: increment of the hardening variable.
+    p: mean stress, Pa, > 0 in tension; ratio: deviatoric stress / its trial value; yields: whether the trial stress is
+    outside the yield surface; apex: 1 for a return to the apex, else 0; hardened: increment of the hardening variable.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

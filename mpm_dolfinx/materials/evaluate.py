@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return data for forms at the points with indices `rows`; values (n, ...): F, parameters and state of all."""
+        """Return form data at the points with indices `rows`; values (n, ...): F, parameters, state of all points."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge of a square or cube with the volume of a cell, m; in uneven grids, of the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell; in uneven grids, the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -220,9 +220,9 @@ class SoftnessAtPoints:
     volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.
     tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
-    With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent shear modulus
-    is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
-    current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
+    The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress tau at F - (1 - s) dF, the tangent shear
+    modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from
+    the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
     At rest the strain is rounding, and its direction is random.  G_t is therefore a weighted mean: the modulus of the
     step has the weight e : e, the modulus before the step the weight `NEAR`^4.  A step at rest thus changes nothing.
@@ -278,7 +278,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces: fields F, position, conductivity and porosity0, if a law is given.
+        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

@@ -180,7 +180,7 @@ class SceneMaterials:
         given = (law.residual is not None) + (law.solution is not None)
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
-            raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
+            raise ValueError(f"{law.__name__}: has {has}, must have one of the two with unknowns, none without")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
             raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
@@ -209,14 +209,14 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have another")
         other = self.shapes.setdefault(name, shape)
         if other != shape:
-            raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")
+            raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
         """Return (law, integration points, whether Q1 cells would lock) for each part of the scene's points.
 
-        A part contains the points of one law.  If only some of its materials are nearly incompressible, the law has two
-        parts.  A single part uses `pieces`.  Several parts have their own integration points, with the fields `common`
-        and the parameters and state of the law.
+        A part contains the points of one law.  If only some materials of a law are nearly incompressible, the law has
+        two parts.  A single part uses `pieces`.  Several parts have their own integration points, with the fields
+        `common` and the parameters and state of the law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -251,8 +251,8 @@ class SceneMaterials:
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return two numbers (n, 2) for each point: its conductivity, m/s, and the index of its conductivity law.
 
-        Points with equal numbers conduct alike; with a law that depends on position all differ.  The fraction of the
-        index denotes the retention curve.
+        Points with equal pairs conduct alike; points with a law that depends on position all differ.  The fractional
+        part of the index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -264,7 +264,7 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number (1, 2, ...) of each point's retention curve (n,); 0 if the pores stay saturated."""
+        """Return the index 1, 2, ... of each point's retention curve (n,); 0 if the pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
@@ -305,8 +305,8 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Evaluate the function `value(material, *columns)` at the points and return the results (n, ...).
 
-        `columns` are further point data (n,), passed to the function.  It returns one value per point, or one number;
-        for a uniform material without columns also one value (...).
+        `columns` are further point data (n,), passed to the function.  The function returns one value per point, or one
+        number; for a uniform material without columns also one value (...).
         """
         each, shapes = [], set()
         for i in self._used:
@@ -320,7 +320,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points with updated fields that depend on the `named` fields, which have changed.
+        """Return the points after a change of the `named` fields: fields that depend on these are updated.
 
         Raises
         ------
@@ -432,7 +432,7 @@ class SceneMaterials:
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) a state variable has changed from its initial value."""
+        """Return at which points (n,) a state variable has changed from its initial value by more than `EVOLVED`."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = (law_of == number).nonzero()[0]
@@ -446,15 +446,15 @@ class SceneMaterials:
 
     @property
     def some_elastic(self) -> bool:
-        """Whether any law is elastic, without a state."""
+        """Whether any law has no state variables, and is therefore elastic."""
         return any(not law.state for law in self.laws)
 
     def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) have an elastic law, without a state."""
+        """Return which points (n,) have a law without state variables, which is therefore elastic."""
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return constants (n, c) that are equal for points of soil with equal elasticity, for any initial stress."""
+        """Return constants (n, c) that are equal at points of the same soil, even if initial stresses differ."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -510,7 +510,7 @@ class SceneMaterials:
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of dt, s, from the points before the step, and `points` with F after it.
+        """Return the point data after a step of dt, s.  `points` have the new F and the old state, `before` the old F.
 
         Raises
         ------
@@ -589,7 +589,7 @@ def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
 
 
 def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
-    """Return a material with its constants as arrays for the first of its points."""
+    """Return the material at its first point: each constant is an array with one value."""
     return _expanded(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
 
 
@@ -615,7 +615,7 @@ def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tupl
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
-    """Return a copy of a material with values (n, ...) of some fields, and its other numbers repeated n times."""
+    """Return a copy of a material with values (n, ...) of some fields, and its other constants repeated n times."""
     out = copy(m)
     for name in constants_of(m):
         value = getattr(m, name)

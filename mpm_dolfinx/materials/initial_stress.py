@@ -23,9 +23,9 @@ from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress at which Newton's method ends; largest allowed one
+EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress: end of Newton's method, largest allowed value
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -34,17 +34,17 @@ LARGEST = 0.2  # limit to the change of a strain component in one iteration
 class K0:
     """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical stress is the overburden of soil and fluid plus the surcharge, minus biot times the pore pressure.  The
-    horizontal stresses (radial and circumferential in axisymmetry) are K0 times the vertical stress.  These stresses
-    are exact for level ground with level layers.  Otherwise an equilibrium step follows.  A warning is given if it
-    changes the stresses by more than 5 %, as on slopes.
+    The vertical stress is the overburden of soil and fluid plus the surcharge, minus biot times the pore pressure
+    (times chi in unsaturated soil).  The horizontal stresses (radial and circumferential in axisymmetry) are K0 times
+    the vertical stress.  These stresses are exact for level ground with level layers.  Otherwise an equilibrium step
+    follows.  A warning is given if this step changes the stresses by more than 5 %, as on slopes.
 
     Parameters
     ----------
     ratio
         K0, >= 0: a number, or a function of the reference positions X (n, d), m.
     surcharge : number or callable x (n, d) -> (n,), Pa
-        Pressure on the ground surface, >= 0, at positions x on the surface, for example of standing water above.
+        Pressure, >= 0, at positions x on the ground surface, for example the weight of standing water.
     """
 
     ratio: Field
@@ -56,13 +56,13 @@ class K0:
                 self._checked(name, getattr(self, name))
 
     def _checked(self, name: str, value, *shapes) -> NDArray[np.float64]:
-        test = {"test": lambda v: (0 <= v) & (v < np.inf), "allowed": ">= 0 and finite, one value or one a place"}
+        test = {"test": lambda v: (0 <= v) & (v < np.inf), "allowed": ">= 0 and finite, one value or one per position"}
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the ratio or surcharge at positions x (n, d), m: one value or (n,)."""
         value = getattr(self, name)
-        given = at_places(f"K0: {name}", "one value a place", value, "x", x) if callable(value) else value
+        given = at_places(f"K0: {name}", "one value per position", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
 
 
@@ -107,13 +107,13 @@ class Hydrostatic(OfWater):
     given: float | None = None
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at positions x (m, d), m."""
+        """Return the pressures (n,), Pa, at positions x (n, d), m."""
         return self.unit_weight * (self.level - x[:, -1])
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
     """Return the initial stress of each body; a single given stress applies to all bodies present at the start."""
-    allowed = "a K0, a function of x, or one of these for each of some bodies, {index: ...}"
+    allowed = "a K0, a function of x, or a dict of these, {index of a body: ...}"
     if given is None:
         return {}
     if not isinstance(given, Mapping):
@@ -196,7 +196,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return three arrays (n,) for K0: overburden, Pa, surface height, m, and biot times pore pressure, Pa."""
+        """Return three arrays (n,) for K0: overburden, Pa; surface height, m; result of `pore_stress`, Pa."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -343,16 +343,13 @@ class _ElasticStrains:
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return the points at their positions, with the elastic strains of `moved`, the same points after deformation."""
-    F = moved.F_of_laws
-    d = F.shape[1]
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
-    whole = np.tile(np.eye(3), (len(F), 1, 1))
-    whole[:, :d, :d] = F
+    whole = unstretched(moved.F_of_laws)
     if "seeded_stretch" in data:
-        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=whole @ data["seeded_stretch"])
+        out = _with(out, np.ones(len(whole), dtype=bool), seeded_stretch=whole @ data["seeded_stretch"])
     if "plastic" in data:
         stretch = materials.table(points, _prestretch)
         whole = whole * (stretch[:, None, :] / stretch[:, :, None])  # D^-1 F D

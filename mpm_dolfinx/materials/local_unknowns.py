@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Local unknowns of laws, determined by equations at each point.
 
-A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points together,
-with errors of round-off.  The forms contain
+A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points together, up
+to round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress with respect
-to y and F is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.
+which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress by F, also
+through y, is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.
 If the stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.
-Then y has a second-order term, whose coefficients also follow from f = 0.  A law in numpy may return y(z) and dy/dz.
+Then y has a second-order term, whose coefficients also follow from f = 0.  A law in numpy returns y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class LocalUnknowns:
     def update(self, data: PointData, derive: bool = True) -> None:
         """Solve for the local unknowns of the points at their present F; all processes must call it.
 
-        derive: also differentiate the unknowns, for expressions that depend on `values`, not on `known` alone.
+        derive: also differentiate by the trial values.  Expressions in `values` need this; `known` does not.
 
         Raises
         ------
@@ -121,7 +121,7 @@ class LocalUnknowns:
             self.derive(data)
 
     def derive(self, data: PointData) -> None:
-        """Differentiate the last solution of the unknowns with respect to F; all processes must call it."""
+        """Differentiate the last solution with respect to the trial values; all processes must call it."""
         solved = self._at(data)
         self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
 

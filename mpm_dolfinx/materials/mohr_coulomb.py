@@ -10,7 +10,7 @@ flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along 
 of the principal values.  It therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric
 and Owen 2008, 8.2, without the cut-off).  On each of them the final stress is linear in the trial stress.  A final
 stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the
-least violation is used; the violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
+least violation is used; its violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # candidates for the final stress in the list of `end`
-NEVER = 1e6  # default tensile strength / bulk modulus
+NEVER = 1e6  # largest tensile strength / bulk modulus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class MohrCoulomb(Frictional):
     cohesion
         Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
-        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default c cot phi (at the apex).
+        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default that of the apex, c cot phi.
 
     Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
 
@@ -127,16 +127,9 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return the principal Kirchhoff stresses, Pa, for ordered principal trial strains.
+    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives (n, 3, 3), and 1 in plastic flow, else 0 (n,).
 
-    Parameters
-    ----------
-    e : (n, 3)
-        Principal strains, the largest first; the other arguments are parameters (n,).
-
-    Returns
-    -------
-    Stresses (n, 3); derivatives with respect to the strains (n, 3, 3); 1 in plastic flow, else 0 (n,).
+    e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,).
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic

@@ -3,7 +3,7 @@
 
 A law is evaluated at F F_i.  F is relative to the seeded state, and F_i is an initial stretch at each point.  The soil
 responds as if loading had caused its initial stress.  Volumes, porosities and conductivities refer to the seeded state.
-F_i is (3, 3), also in plane strain.  In laws with the state `plastic`, C_p^-1 contains the initial strain.
+F_i is (3, 3), also in plane strain.  Laws with the state `plastic` use C_p^-1 in place of F_i.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of state variables as seeded; a point has yielded if its state differs from them."""
+"""Suffix of the names of state variables as seeded; a point has yielded if its state differs from these values."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material with a point field for the initial stress, which is zero until it is set.
+    """Return a material in which the initial stress, or the strain that causes it, is a point field that is set later.
 
     knows_space: whether the material's law accepts F (3, 3).
     """

@@ -25,7 +25,7 @@ Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...)."""
 
 BY_SCENE = ("dt", "cell_size")
-"""Arguments of laws from the scene: time since the start of the step, s, and mean length of a cell, m."""
+"""Arguments that laws receive from the scene: time since the start of the step, s; mean edge length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
 """States that the scene sets: the suction max(-p, 0), Pa, at the end of a substep, and at seeding."""
@@ -71,42 +71,42 @@ class Skeleton:
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
         see `retention`; keyword only.  With None the pores stay saturated.
 
-    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  These may have
-    the arguments F, and fields, properties and state of the law.  F is (d, d), in axisymmetry (3, 3) with the
-    circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last, in two
-    cases: if Q1 cells would lock, and for soil with an initial stress.  If the law rejects this shape, F is (2, 2).
+    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Their arguments
+    may be F, and fields, properties and state of the law.  F is (d, d), in axisymmetry (3, 3) with the circumferential
+    stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last, in two cases: if Q1
+    cells would lock, and for soil with an initial stress.  If the law rejects this shape, F is (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
     kirchhoff
-        Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy; the tangent is UFL's.
+        Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy.  UFL gives the tangent.
 
     The history variables are the law's `state`, name -> initial value.  `update` (F, ...) -> {name: UFL} computes them
     at the points after every converged step.  If a new value is not finite, the time step is reduced.
 
-    A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  They are
-    arguments of `kirchhoff` and `update`.  Unknowns and their equations should be of order one:
+    A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  Unknowns
+    are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to values of about one:
 
     residual
-        Function of the law's fields, state, unknowns and `trial`.  It returns name -> UFL of the unknown's shape.
-        Newton's method solves residual = 0 at each point.
+        Function of the law's fields, state, unknowns and `trial`.  It returns a dict: name of the unknown -> UFL of the
+        unknown's shape.  Newton's method solves residual = 0 at each point.
     solution
         Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
         returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
-        name of the trial value.  It suits return mappings with many cases, and existing codes.  Its unknowns are the
-        stress and the new state.  A derivative may be a function without arguments, called when a tangent is assembled.
-        A missing derivative is zero.  If there is no solution, values are NaN or infinite; the time step is then
-        reduced.  If `energy` is not stationary in them, second derivatives are missing and Newton's method is slow.
+        name of the trial value.  This suits return mappings with many cases, and existing codes.  Usual unknowns are
+        stress and new state.  A derivative may be a function without arguments, called when a tangent is assembled.  A
+        missing derivative is zero.  Without a solution, values are NaN or infinite, and the time step is reduced.  If
+        `energy` is not stationary in the unknowns, second derivatives are missing: Newton's method is slow.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
         have F itself as argument.  Values other than UFL are passed to `kirchhoff` and `update` only, in `trial`.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
-    The new state must give the stress at the end of the step again if it is evaluated with dt = 0.  They may have the
-    argument `cell_size`, the mean edge of a cell, m, which makes softening independent of the grid.
+    Evaluated with the new state and dt = 0, a law must return the same stress as at the end of the step.  The argument
+    `cell_size`, the mean edge length of a cell, m, can make softening independent of the grid.
 
-    A law that depends on suction has the state `suction`: 0.0, and may have the state `suction_at_start`: 0.0.  The
-    scene sets them to max(-p, 0), Pa, at the end of a substep and at seeding.  For local unknowns, use it in `trial`.
+    A law that depends on suction has the state `suction`: 0.0, and optionally `suction_at_start`: 0.0.  The scene sets
+    max(-p, 0), Pa: the first at the end of a substep, the second at seeding.  Laws with unknowns use it in `trial`.
 
     For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 
@@ -294,9 +294,9 @@ class Skeleton:
         """Return the damping tau, 1/Pa: 1/4 of the jump stabilisation of 2 x 2 cells, or 1/2 for laws with a state.
 
         The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
-        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is smaller by a factor of up to
-        0.44.  In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards
-        in plane strain.  Only the increment of each step is damped, so an oscillation from the onset of yield remains.
+        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is smaller, down to 0.44 times.
+        In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards in plane
+        strain.  Only the increment of each step is damped, so an oscillation from the onset of yield remains.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -455,7 +455,7 @@ class unsaturated:
     least
         Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  With 0, for steady flow, a free surface falls at once.
+        Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once (for steady flow).
     """
 
     suction: float
@@ -485,8 +485,8 @@ class Fluid:
         Density rho_w at zero pressure, kg/m^3, > 0, used for the weight; the flowing mass has rho_w exp(p / K_w).
     gravity
         Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default the scene's gravity if it is a
-        constant vector other than zero, else 9.81.  With units other than m and s, scenes without gravity, or with
-        gravity as a function of time, require it.
+        constant vector other than zero, else 9.81.  With units other than m and s, this argument is required in scenes
+        without gravity, or with gravity as a function of time.
 
     Raises
     ------

@@ -7,8 +7,8 @@ strain gamma and the cell size h (crack band: Bazant and Oh 1983; Pietruszczak a
 
     c = c_0 - (c_0 - c_r) min(1, gamma h / s),
 
-and softening along a band dissipates (c_0 - c_r) s / 2 on any grid.  The viscosity is Perzyna's, f = eta dgamma/dt,
-with the yield function f.  It is linear and integrated implicitly, and has no effect in slow loading.
+so that softening along a band dissipates (c_0 - c_r) s / 2 per area, on any grid.  The viscosity is Perzyna's, f = eta
+dgamma/dt, with the yield function f.  This law is linear and integrated implicitly, and has no effect in slow loading.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class SofteningDruckerPrager(DruckerPrager):
     residual
         Residual cohesion c_r, Pa, in [0, cohesion]; if it equals the cohesion, there is no softening.
     slip
-        Slip s along a shear band, m, > 0, at which the cohesion is c_r.  ValueError if the cells are so large that
-        the soil would soften faster than it unloads.
+        Slip s along a shear band, m, > 0, at which the cohesion has fallen to c_r.  The scene raises ValueError if
+        cells are so large that the soil would soften faster than it unloads.
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 

@@ -7,10 +7,10 @@ The name of an argument determines its value.  Laws and conductivities belong to
 points
     Quadrature points.  `points.dx` is their measure, which adds up to the volumes of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v; the gradient is (3, 3) in
-    axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, of the same shape, with
-    the volume ratio as determinant.  `points.position` and `points.displacement` are the position, and the displacement
-    since the start of the run or the last reset, both at the start of the step.  Other names: fields of materials that
-    are functions of position, and the laws' state.
+    axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u,
+    with the volume ratio as determinant.  `points.position` and `points.displacement` are values at the start of the
+    step; displacements count from the start of the run or the last reset.  Other names: fields of materials that are
+    functions of position, and the laws' state.
 t
     Time at which the balances hold, s, a UFL constant: the end of the step or of its first substep.
 
@@ -111,7 +111,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
     Raises
     ------
     ValueError
-            The result is no dict of UFL with these names and shapes, or all values are constant.
+        The result is no dict of UFL with these names and shapes, or all values are constant.
     """
     instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}

@@ -15,9 +15,28 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.cell_matrices import along_shapes
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
-from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+
+
+def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
+    """Return the sums of the pieces of one part for `OfSuction`; None if there are none.
+
+    Parameters
+    ----------
+    points, locks
+        Integration points of the pieces; whether their law uses the mean dilatation.
+    F
+        Deformation gradient (d, d), a UFL variable.
+    slopes
+        UFL derivatives with respect to the pressure, Pa: of the first Piola-Kirchhoff stress (d, d) and, with mean
+        dilatation, of the stress pi conjugate to theta.  Empty if the law is independent of suction.
+    """
+    share = 1 / ufl.det(points.F)
+    tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
+    tensors += [share * slope for slope in slopes[:1]]
+    along = [part for T in tensors for part in along_shapes(T * points.F.T, points)]
+    return CellSums([*along, *(share * slope for slope in slopes[1:])], points) if tensors else None
 
 
 class OfSuction:
@@ -25,40 +44,22 @@ class OfSuction:
 
     Parameters
     ----------
-    grid
-        Background grid.
+    dim
+        Number of axes.
     dilatation
         Mean dilatation of cells, None if no cell would lock.
+    sums
+        For each part, see `SceneMaterials.parts`, the result of `suction_sums`.
     """
 
-    def __init__(self, grid: Grid, dilatation: MeanDilatation | None):
-        self._dilatation, self._width = dilatation, 2**grid.dim * grid.dim
-        self._free: dict[int, CellSums] = {}
-        self._locked: dict[int, CellSums] = {}
-
-    def add(self, number: int, points: FormPoints, F, slopes: Sequence, locks: bool) -> None:
-        """Add the pieces of one part, see `SceneMaterials.parts`.
-
-        Parameters
-        ----------
-        number, points, locks
-            Index of the part; integration points of its pieces; whether its law uses the mean dilatation.
-        F
-            Deformation gradient (d, d), a UFL variable.
-        slopes
-            UFL derivatives with respect to the pressure, Pa: of the first Piola-Kirchhoff stress (d, d) and, with mean
-            dilatation, of the stress pi conjugate to theta.  Empty if the law is independent of suction.
-        """
-        share = 1 / ufl.det(points.F)
-        tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
-        tensors += [share * slope for slope in slopes[:1]]
-        along = [part for T in tensors for part in along_shapes(T * points.F.T, points)]
-        scalars = [share * slope for slope in slopes[1:]]
-        if tensors:
-            (self._locked if locks else self._free)[number] = CellSums([*along, *scalars], points)
+    def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):
+        self._dilatation, self._width = dilatation, 2**dim * dim
+        self._locked = {} if dilatation is None else {number: sums[number] for number in dilatation.numbers}
+        found = {number: of for number, of in enumerate(sums) if of is not None}
+        self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return for each part its cells (c,), and derivatives (c, n), m^(d-1), of nodal forces by their pressures."""
+        """Return pairs of cells (c,), and derivatives (c, n), m^(d-1), of nodal forces by these cells' pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

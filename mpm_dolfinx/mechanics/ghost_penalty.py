@@ -5,11 +5,11 @@ The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement incremen
 affect neither the conditioning nor the accuracy. The penalty resists each step's increment like a viscosity, so it must
 not act on load-bearing cells:
 
-* The strength s of a face falls from 1 to 0 as the ratio of the emptier to the fuller cell's filling rises to RATIO. A
-  second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier cell).  Nearly
-  empty cells thus follow full ones easily.  A penalty between equally filled cells would resist kinks of the body.
+* The strength s of a face falls from 1 to 0 as (filling of the emptier cell) / (filling of the fuller cell) rises from
+  0 to RATIO. A second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier one).
+  Nearly empty cells thus follow full ones easily.  A penalty between equally filled cells would resist kinks of a body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
-  stretch of the full neighbour, against their own volume constraint.  In flowing soil `stiffness` is below 2G.
+  stretch of the full neighbour, against their own volume constraint.  In flowing soil the modulus `stiffness` is < 2G.
 
 With integration at the material points, any cell may hold too few points for its nodes. Then all faces of cells that
 are not full have a penalty of strength 0.2.
@@ -41,7 +41,7 @@ RATIO = 0.3
 result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""With integration at the points: strength of the penalty, and volume fraction below which faces of a cell have it."""
+"""With integration at points: strength of the penalty; all faces of cells with a volume fraction below FULL have it."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
@@ -69,10 +69,8 @@ class GhostPenalty:
 
     Parameters
     ----------
-    grid
-        Background grid.
-    V
-        Space of the displacement.
+    grid, V
+        Background grid, and space of the displacement.
     at_points
         Whether bodies are integrated at their material points.
 
@@ -83,7 +81,7 @@ class GhostPenalty:
     shear
         Shear modulus, Pa, of laws with a state: mean over the material in the cell; zero for other laws.
     firmness
-        Form of the elastic shear stiffness in the cells, times their volume fraction; it regularises tangents.
+        Form that regularises tangents: elastic shear stiffness of the cells times their volume fraction.
     fill, beside
         Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """
@@ -116,7 +114,8 @@ class GhostPenalty:
     ) -> NDArray[np.int64]:
         """Set the volume fractions and moduli of the cells `own` (n,), owned cells that contain material.
 
-        Return all active local cells, ascending; volume (n,), m^d; moduli (n,): `modulus` and `shear` times volume.
+        Return all active local cells, ascending.  volume (n,): of the material in each cell, m^d; moduli (n,): products
+        of `modulus` and of `shear` with this volume.
         `fill` must be zero before the call.
         """
         grid, fill = self.grid, self.fill.x.array

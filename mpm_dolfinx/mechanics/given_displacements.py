@@ -26,19 +26,20 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
-from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
+ARTEFACT = "%s: not at its prescribed position at %s: %s"
+
 
 class HoldForms:
-    """Forms of the penalty at points or for their means: stiffness, and force towards the prescribed displacement."""
+    """Forms of penalties, at points or on means over points: stiffness, and force towards the prescribed position."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -81,15 +82,14 @@ class GivenDisplacements(Acting):
         self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
-        self._warned: set[int] = set()  # indices of the conditions with a warning in the log
-        self._jumped: set[int] = set()  # likewise, for jumps at the start
+        self._warned: set[tuple[int, str]] = set()  # indices of the conditions with a warning in the log, and its text
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
             if common := sorted(set(axes) & set(more)):
-                check_apart(one, faces, other, others)
-                self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
-        self._holds = self.held = held_faces(setting)
+                faces.check_apart(others, (one, other))
+                self._meeting.append((one, other, common, sides.meeting(faces, others)))
+        self._holds = self.held = setting.held
         for hold in displacements.values():
             if not callable(hold.value):  # values of functions are checked when they are called
                 hold.at(0.0, np.empty((1, d)))
@@ -100,9 +100,9 @@ class GivenDisplacements(Acting):
         return [faces for _, faces, _ in self._holds]
 
     def check_start(self, place: Place) -> None:
-        """Warn, once for each condition, if it moves its side at once as bodies with inertia begin to move.
+        """Warn, once for each condition, if its side must jump at the start of a stage with inertia.
 
-        The motion in a single step strains the cell at the side more than the stress there.
+        A gap is a jump if it strains the cell at the side by more than (stress there) / (modulus there).
         """
         if not (place.inertia and place.dt):
             return
@@ -114,11 +114,10 @@ class GivenDisplacements(Acting):
             strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
             sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
             jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
-            if jump and number not in self._jumped:
-                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: it %s"
-                why = "counts from the start or the last reset_displacement, must begin at the present position"
-                warn(self._grid.comm, ConditionWarning, what, line(hold), jump, place.start, why)
-                self._jumped.add(number)
+            if jump:
+                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: %s"
+                why = "values count from the start or the last reset_displacement, must begin at the present position"
+                self._warn(number, what, jump, place.start, why)
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep: one for each component and each cell or point."""
@@ -145,9 +144,9 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, on the processes that own the cells whose constraints contain them.
+        """Return the integration points on sides, each on the process that owns the cell with the point's constraint.
 
-        ends: start and end of the step, s, empty for zero displacement.
+        ends: start and end of the step, s; empty if the displacement is zero.
         """
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
@@ -175,12 +174,12 @@ class GivenDisplacements(Acting):
             values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
             rows.append((p.cell, p.x, values))
             bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
-        cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
+        cell, x, values = self._grid.gathered(rows, 6 + 5 * d)
         extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
         sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
         inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
         if over_all(self._grid.comm, int((inner != cell).any())):
-            cell, x, values = gathered(self._grid, [(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
+            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
         number, *own = values[:, :6].T
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
@@ -194,7 +193,7 @@ class GivenDisplacements(Acting):
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
-        return everywhere(self._grid, lambda: hold.at(t, X))
+        return everywhere(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return reactions, by quantity and name of the condition, with every component equal to `value`."""
@@ -205,20 +204,19 @@ class GivenDisplacements(Acting):
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
-        self._warn(held, loads.row, data["direction"].argmax(axis=1), force)
+        told = {number for number, what in self._warned if what == ARTEFACT}
+        for number, x in held.beyond(loads.row, data["direction"].argmax(axis=1), force, told):
+            why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
+            self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
         sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
-    def _warn(
-        self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
-    ) -> None:
-        """Warn, once for each condition, if a reaction exceeds any stress increment that the body can bear."""
-        for number, x in held.beyond(row, axis, force, self._warned):
-            why = "its reaction is an artefact; is it also held by another condition, or is the step too large?"
-            what = "%s: not at its prescribed position at %s: %s"
-            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), x + self._grid.base, why)
-            self._warned.add(number)
+    def _warn(self, number: int, what: str, *values) -> None:
+        """Warn, once for each condition, of what is wrong with the condition with this index."""
+        if (number, what) not in self._warned:
+            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
+            self._warned.add((number, what))
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise NotConverged if all points of a side follow less than half of their prescribed increment."""
@@ -296,14 +294,14 @@ class HoldLoads(Loads):
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
-        self._asked = data["gap"][:, 0]  # of means: their gaps contain nothing else at first
+        self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
         self._lacked = np.full(len(acting.held) * self._d, np.inf)
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces of cell means to their multipliers, on sides that lag behind their displacement.
+        """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
 
         A body such as one of sealed water resists the side's motion more stiffly than a single cell would.  The updates
-        end if the mean gap no longer falls by half: the cells cannot follow the side any further.
+        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.
         """
         if not self._place.dt:
             return False
@@ -325,7 +323,7 @@ class HoldLoads(Loads):
         self._forms.pull.assemble_vector(b, self.data)
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the penalty stiffness; `counted` returns its forces on walls of the grid."""
+        """Add the penalty stiffness; the penalty forces on walls of the grid come from `counted`."""
         if not walls:
             self._forms.hold.assemble_matrix(A, self.data)
 
@@ -349,7 +347,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return degrees of freedom (n,), and the penalty forces (n,), N, on them for the forces of walls."""
+        """Return unrolled dofs (n,), and penalty forces (n,), N, on them that do not count as reactions of walls."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )
@@ -394,10 +392,3 @@ class HoldLoads(Loads):
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions."""
         return {"reactions": self._acting.reactions(self, at)}
-
-
-def held_faces(setting: Setting) -> list[tuple[Displacement, Surface, Sequence[int]]]:
-    """Return the conditions of a stage with the faces and the axes on which they are imposed."""
-    holds = [(hold, hold.axes(setting.grid.dim)) for hold in setting.of(Displacement).values()]
-    others = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
-    return [(hold, setting.sides.held(hold, rest), axes) for (hold, axes), rest in zip(holds, others, strict=True)]

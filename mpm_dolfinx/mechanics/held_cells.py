@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak one on deviations from the mean.
 
-A Q1 field has too few nodal displacements in a cell to meet constraints at many points of a side. A stiff penalty at
+A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side. A stiff penalty at
 each point would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero mean
 in each cell. The present traction of the body, rotated with the side, is applied explicitly. The penalties
 then bear only the traction increment of the step, and the gap between side and prescribed position is small.
@@ -17,13 +17,18 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.conditions.conditions import HOLD, WEAK
+from mpm_dolfinx.conditions.conditions import HOLD
 from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
 """Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
+WEAK = 8.0
+"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).  Halving
+this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
+finer cells by 3.0e-02.
+"""
 EVERYWHERE = 1e2
 """Normal penalty stiffness at each point of a side with a slope below `ALIGNED`, in units of resistance / cell size.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.2e-05 (relative), doubling it by
@@ -34,7 +39,7 @@ TENSE = 10
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
 4.7e-06, and finer cells by 3.0e-02.
 """
-CARRIED = 0.3  # largest plausible traction increment of a step / (resisting modulus and stress of the body)
+CARRIED = 0.3  # largest plausible traction increment of a step / (resisting modulus + TENSE * stress of the body)
 
 
 class HeldPoints(NamedTuple):
@@ -43,7 +48,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N, at the last reset of the grid, as the next three
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; this and the next three: at the last grid reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     firm: NDArray[np.float64]  # (n,) confined modulus times area, N
@@ -68,8 +73,9 @@ def inner_cells(
     contradict those of inner cells: only a large motion of nodes beyond the line, which nothing resists, could satisfy
     both.  The inner cell therefore takes these points too (aggregation; Badia, Verdugo and Martin 2018).
 
-    fill (cells,): volume fraction; sides: prescribed components and extent (d,), m, of the prescribed positions of each
-    condition; number, cell, normal (n,), (n,), (n, d): condition, owned cell and outward area vector of each point.
+    fill (cells,): volume fraction; sides: for each condition its prescribed components, and the extent (d,), m, of its
+    prescribed positions.  For each point: index of its condition, `number` (n,); its owned `cell` (n,); its outward
+    area vector, `normal` (n, d).
     """
     inner = cell.astype(np.int64)
     for k, (axes, extent) in enumerate(sides):
@@ -98,11 +104,12 @@ class HeldCells:
     Attributes
     ----------
     number, cell, x, shape, moments
-        Condition, cell, mean position, m, mean shape functions, mean products of offsets from the cell's midpoint, m,
-        of each penalty.
-    stiffness, limit
-        Penalty stiffness of each component, N/m, from the confined modulus along the normal of a side parallel to the
-        grid.  Largest plausible force of each mean, N; larger forces are artefacts.
+        For each penalty: index of the condition; cell; position, m; shape functions; products of offsets from the
+        cell's midpoint, m^2 and m^3.  For a penalty on a mean, the last three are means over its points.
+    stiffness
+        Stiffness of each penalty and component, N/m.  Normal to a side parallel to the grid: from the confined modulus.
+    limit
+        Largest plausible force of each penalty on a mean, N; larger forces are artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -157,19 +164,12 @@ class HeldCells:
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
-        Where a side meets a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
-        would compensate for the fixed ones, with an oscillation along the side. If a side moves at such a wall by more
-        than half of its displacement in the cell, its displacement must vary over this cell. This is checked at the
-        start and the end of the step. The penalty is then omitted if other penalties hold a free node of the cell.
+        Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
+        would compensate for the fixed ones, with an oscillation along the side. The prescribed displacement is also
+        extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
+        the displacement must vary over the cell. The penalty is then omitted if others hold a free node of the cell.
 
-        Parameters
-        ----------
-        axis
-            The component.
-        given : (conditions,)
-            Conditions that prescribe the component.
-        free : (nodes,)
-            Nodes that no wall fixes in this component.
+        axis: the component; given (conditions,): conditions that prescribe it; free (nodes,): nodes that no wall fixes.
 
         Returns
         -------
@@ -200,7 +200,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties (k,) have a node at a wall, and also a free node of a penalty away from walls.
+        """Return which penalties (k,) at a wall share a free node with a penalty of the same condition away from walls.
 
         number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): flags of nodes at a wall.
         """
@@ -219,18 +219,14 @@ class HeldCells:
     def beyond(
         self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return indices of conditions whose force exceeds its limit, and the position (d,), m, of each largest excess.
+        """Return conditions with forces beyond their limits: index of each, and position (d,), m, of its worst force.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
-        penalties then push the side to and fro. Only the sum of their forces at the nodes acts on the body and counts
-        in the reaction. A penalty thus exceeds its limit only if its own force and the condition's nodal forces do.
+        penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
+        counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
 
-        Parameters
-        ----------
-        row, axis, force : (k,)
-            Penalty (its index), component (its axis), and force, N.
-        told
-            Indices of conditions that have been reported already; they are excluded.
+        row, axis, force (k,): penalty (its index), component (its axis), and force, N; told: indices of conditions that
+        have been reported already, which are excluded.
         """
         grid = self.grid
         comm = grid.comm

@@ -13,11 +13,11 @@ The mass is integrated over the pieces of the particle domains, with second mome
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-with the ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full. G vanishes for affine
-fields, for which M and the right side agree. The transfer to the grid and back therefore conserves linear and angular
-momentum to rounding. Material points carry v and F', the rate of F; the velocity over their domain is v + F' F^-1 (x -
+with the ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full. For an affine field G
+v_n vanishes, and M v_n is the right side. The transfer to the grid and back therefore conserves linear and angular
+momentum to rounding. A material point carries v and F', the rate of F; the velocity in its domain is v + F' F^-1 (x -
 x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and
-Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects its error for rotations.
+Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects this rule's error for rotations.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass. With 0.002 and 0.2, momentum and energy of a rotating block do not change.
+"""Strength c of the ghost mass. With 0.002 or 0.2 instead, a rotating block has the same momentum and energy.
 
 `tests/test_inertia.py` tests this.
 """
 RELAXES = 2.0
-"""Relaxation rate of point velocities towards grid velocities, per cell size of motion of the domain's corners.
+"""Relaxation rate of point velocities towards grid velocities, for each cell size by which domain corners move.
 
 Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
 moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates
@@ -104,11 +104,11 @@ def moving(
     Parameters
     ----------
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Velocity, or a function of position.  Each domain stores the affine field nearest to its values at the corners.
+        Velocity, or a function of position.  Each domain stores the affine field nearest to the values at its corners.
     base : (d,), m
         Origin of the points' coordinates.
     rings
-        Whether the domains are rings of an axisymmetric scene, with centroids of volumes.
+        Whether the domains are rings (axisymmetry): a point's velocity is then that at the centroid of its ring.
 
     Raises
     ------
@@ -200,7 +200,7 @@ class InertiaForms:
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the acceleration in the forms, or zero if inertia is None; midpoint: whether the substep is one."""
+        """Set the forms' acceleration, zero if inertia is None; midpoint: whether the substep uses a midpoint rule."""
         self._midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
@@ -317,7 +317,7 @@ class Mass:
         velocities
             Velocities of the unknowns at the start and the end of the step, m/s.
         moved : (n,)
-            Largest displacement of a domain's corner, divided by the cell size, if the grid is reset, else 0.
+            Largest displacement of a corner, in cell sizes, in the connected part of the point; 0 if its cut is kept.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -347,7 +347,7 @@ class Mass:
         return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return `VELOCITY` and `RATE` of the affine field in each domain nearest to nodal velocities v, m/s."""
+        """Return `VELOCITY` and `RATE` of each domain: the affine field nearest to the field of velocities v, m/s."""
         cut, grid, d, nodal = self._cut, self._forms.grid, self._forms.grid.dim, self.local(v)
         at, slope = grid.at(cut.cells, cut.x, nodal.reshape(-1, d)), self._pieces.gradients_of(nodal)
         at, slope = (cut.to_pieces(values) for values in (at, slope.reshape(-1, d, d)))
@@ -372,7 +372,7 @@ class Inertia(Loads):
     flight
         Inertial predictor: displacement without forces, from the velocities alone, m.
     rate
-        g^-2, with the weight g of the substep's own rate, s, in 1/s^2.
+        1 / g^2, 1/s^2, with the weight g, s, of the substep's own rate.
     """
 
     holding = True
@@ -426,7 +426,7 @@ class Flight(NamedTuple):
     acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the inertial predictor of the next substep, m; own, before: weights of its and the last rate, s."""
+        """Return the inertial predictor of the next substep, m; own, before: weights, s, of this and the last rate."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

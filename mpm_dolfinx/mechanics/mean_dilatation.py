@@ -12,15 +12,16 @@ only the materials that would lock use Fbar. The energy sum w psi(Fbar) / J_n ha
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-For given (theta, pi) the residual has the additional term with pi, and a symmetric tangent. The contribution of
-theta and pi has rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material point method:
-Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar. The next step
-starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
+At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives by
+theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material
+point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar.
+The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -40,42 +41,42 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
-class MeanDilatation:
-    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
+class SumsOfPart(NamedTuple):
+    """Sums over the integration points of one part in each cell, for theta and pi: see `MeanDilatation`."""
+
+    ratio: CellSums
+    stress: StressAtPoints
+
+
+class FBar:
+    """F-bar modification of laws, with the volume ratio theta of the step in each cell and its mean stress pi.
 
     Parameters
     ----------
     grid
         Background grid.
-    numbers
-        Indices of the parts in which cells would lock, see `QuadratureData`, in the order of the calls of `add`.
     symmetric
         Whether the tangents of all laws are symmetric.
     """
 
-    def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
-        self._grid = grid
-        self._symmetric = symmetric
-        self._numbers = numbers
+    def __init__(self, grid: Grid, symmetric: bool):
+        self.grid = grid
+        self.symmetric = symmetric
         self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
         self._theta = ufl.variable(self.theta)
-        self._filled: Latest[Cells] = Latest()
-        self._volume: Latest[NDArray[np.float64]] = Latest()
-        self._ratios: list[CellSums] = []
-        self._stresses: list[StressAtPoints] = []
 
-    def fbar(self, points: FormPoints, F):
+    def of(self, points: FormPoints, F):
         """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that accept only F (2, 2)."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
-        if self._grid.stretches == 2 and ACROSS not in points.functions:
+        if self.grid.stretches == 2 and ACROSS not in points.functions:
             return ufl.variable(ufl.sqrt(ratio) * F)
         ratio = ratio ** (1 / 3)
-        if self._grid.stretches == 2:  # F and the out-of-plane stretch are scaled together, see `in_space`
+        if self.grid.stretches == 2:  # F and the out-of-plane stretch are scaled together, see `in_space`
             across = getattr(points, ACROSS)
             return ufl.variable(embedded(ratio / ufl.sqrt(across) * F, ratio * across))
-        return ufl.variable(block(ratio * F) if self._grid.axisymmetric else ratio * F)
+        return ufl.variable(block(ratio * F) if self.grid.axisymmetric else ratio * F)
 
-    def add(
+    def forms(
         self,
         law: type[Skeleton],
         points: FormPoints,
@@ -85,7 +86,7 @@ class MeanDilatation:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Add the integration points of one part, whose Q1 cells would lock without F-bar.
+        """Return the stress and the sums of one part, whose Q1 cells would lock without F-bar.
 
         Parameters
         ----------
@@ -96,7 +97,7 @@ class MeanDilatation:
         F
             Deformation gradient (d, d), a UFL variable.
         Fbar
-            F-bar modification of F, see `fbar`.
+            F-bar modification of F, see `of`.
         ratio
             det Delta, with Delta F_n = F.
         values
@@ -107,17 +108,16 @@ class MeanDilatation:
         Returns
         -------
         The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  Its derivative with respect
-        to F (d, d, d, d), Pa, for the tangent.  Quantities to be summed in each cell, for `assemble_matrix`.
+        to F (d, d, d, d), Pa, for the tangent.  Quantities to be summed in each cell, and sums, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
-        self._ratios.append(CellSums([ratio], points))
         P, slope = self._stress(law, F, Fbar, known)
-        self._stresses.append(StressAtPoints(P, slope / J_n, points))
+        sums = SumsOfPart(CellSums([ratio], points), StressAtPoints(P, slope / J_n, points))
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
         shared, share = self.pi * ufl.diff(J, F), 1 / J_n
-        along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self._symmetric else [P_theta]))]
+        along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self.symmetric else [P_theta]))]
         beside = Beside(along, [share * slope_theta])
-        return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
+        return sums.stress.P + shared, P_F + ufl.diff(shared, F), beside, sums
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of psi(Fbar), or of a law's work without energy, with respect to F and theta."""
@@ -132,16 +132,10 @@ class MeanDilatation:
         """Return the derivatives of both results of `_stress` with respect to a pressure p, a UFL variable."""
         return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
 
-    def total(
-        self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, the sums over all parts in each, and its volume with F-bar (cells, 1)."""
-        return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
-
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In 2D a law without an energy is differentiated with respect to Fbar only, which takes half of the time.  With
+        In 2D a law without an energy is differentiated with respect to Fbar only: tangents take half of the time.  With
         Fbar = s F,
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
@@ -149,7 +143,7 @@ class MeanDilatation:
         for F (d, d) and the same components of s F. In 3D this would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
-        if law.kirchhoff is None or self._grid.dim == 3:
+        if law.kirchhoff is None or self.grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
         d, n = range(F.ufl_shape[0]), Fbar.ufl_shape[0]
         theta = self._theta
@@ -173,11 +167,37 @@ class MeanDilatation:
         )
         return P_F, _dev(tau_theta, F) * G, mean_F / theta, (mean_theta - slope) / theta
 
+
+class MeanDilatation:
+    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
+
+    Parameters
+    ----------
+    fbar
+        The fields theta and pi.
+    parts
+        Sums of the parts in which cells would lock, by index of the part, see `QuadratureData`.
+    """
+
+    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):
+        self._grid, self._symmetric = fbar.grid, fbar.symmetric
+        self.theta, self.pi = fbar.theta, fbar.pi
+        self.numbers = list(parts)
+        self._sums = list(parts.values())
+        self._filled: Latest[Cells] = Latest()
+        self._volume: Latest[NDArray[np.float64]] = Latest()
+
+    def total(
+        self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the cells with F-bar, the sums over all parts in each cell, and the volumes (cells, 1) with F-bar."""
+        return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
+
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
         """Set theta, the stresses and pi at the present displacement; solve: function that solves local unknowns."""
-        self._set_mean(self.theta, self._ratios, data)
+        self._set_mean(self.theta, [of.ratio for of in self._sums], data)
         solve()
-        self._set_mean(self.pi, self._stresses, data)
+        self._set_mean(self.pi, [of.stress for of in self._sums], data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
         """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
@@ -190,16 +210,17 @@ class MeanDilatation:
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
 
-        sums: for each part, the sums (cells, quantities) of the quantities that `add` returned.
+        sums: for each part, the sums (cells, quantities) of the quantities that `FBar.forms` returned.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
-            self._cells(data).total([sums[number] for number in self._numbers]) / volume,
+            self._cells(data).total([sums[number] for number in self.numbers]) / volume,
             range(count, (2 if self._symmetric else 3) * count + 1, count),
             axis=1,
         )
         d = c if self._symmetric else other[0]
-        # (d b^T + b c^T + e b b^T) V with the means b, c, d, e of the derivatives of det(Delta), dPsi/dtheta, P
+        # (d b^T + b c^T + e b b^T) V; means over the volume V of derivatives: b of det(Delta) by u, c and e of
+        # dPsi/dtheta by u and theta, d of P by theta
         columns, rows = (c + 0.5 * e * b) * volume, (d + 0.5 * e * b) * volume
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
@@ -207,14 +228,14 @@ class MeanDilatation:
     def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
         """Return the gradients Delta (m, d, d) of the pieces, scaled to the cell's volume ratio where F-bar is used."""
         delta = delta.copy()
-        for number in self._numbers:
+        for number in self.numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
             delta[rows] = with_ratio(own, theta)
         return delta
 
     def _parts(self, data: QuadratureData) -> list[PointData]:
-        return [data.parts[number] for number in self._numbers]
+        return [data.parts[number] for number in self.numbers]
 
     def _cells(self, data: QuadratureData) -> Cells:
         """Return the cells with pieces that use F-bar."""

@@ -13,7 +13,8 @@ Piola-Kirchhoff effective stress relative to the start of the step.  A law may d
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -26,7 +27,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
 from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import FormPoints
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
@@ -34,15 +35,25 @@ from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
-from mpm_dolfinx.mechanics.dried import OfSuction
+from mpm_dolfinx.mechanics.dried import OfSuction, suction_sums
 from mpm_dolfinx.mechanics.ghost_penalty import GhostPenalty
 from mpm_dolfinx.mechanics.inertia import InertiaForms
-from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
+from mpm_dolfinx.mechanics.mean_dilatation import FBar, MeanDilatation, SumsOfPart
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.user_terms import OwnTerms
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.active import Active, ActiveSet
 from mpm_dolfinx.points.parts import OfParts, Parts, relative
+
+
+class FormsOfPart(NamedTuple):
+    """Compiled forms of one part of the points."""
+
+    residual: ElementForces
+    tangent: ElementMatrices | StackedElementMatrices
+    local: LocalUnknowns | None  # None for laws without local unknowns
+    means: SumsOfPart | None  # None without mean dilatation
+    dried: CellSums | None  # for laws that depend on suction, see `suction_sums`
 
 
 class MomentumForms:
@@ -92,18 +103,16 @@ class MomentumForms:
         """Displacement increment since the start of the step, m."""
         rooms = [fem.Function(V) for _ in range(3)]
         self._rooms = [(room, room.x.array) for room in rooms]  # buffers for sums of forces that exist together
-        averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
-        self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
+        self._fbar = FBar(grid, symmetric) if any(locks for *_, locks in laws) else None
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
         """Forms of inertia, None in a scene without inertia."""
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
-        self._of_suction = OfSuction(grid, self.dilatation) if dried else None
-        self._local: dict[int, LocalUnknowns] = {}  # by index of the part of the points
-        made = []
-        for number, (law, points, locks) in enumerate(laws):
-            given = by_scene(grid, None, law, points) | {"dt": dt}
-            made.append(self._forms_of_law(number, law, points, locks, pressure, symmetric, given))
-        self._residuals, self._tangents = zip(*made, strict=True)
+        self.law_forms = [self._forms_of_law(*law, pressure, dried, symmetric, dt) for law in laws]
+        """Forms of each part of the points."""
+        locked = {number: part.means for number, part in enumerate(self.law_forms) if part.means is not None}
+        self.dilatation = MeanDilatation(self._fbar, locked) if locked else None
+        sums = [part.dried for part in self.law_forms]
+        self._of_suction = OfSuction(grid.dim, self.dilatation, sums) if dried else None
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """Forms of the scene's conditions."""
@@ -114,7 +123,7 @@ class MomentumForms:
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """Weight and user-defined terms, which act in all stages."""
         self.symmetric = symmetric and self.own.symmetric
-        self.linear = not averaged and all(law.linear for law, *_ in laws)
+        self.linear = not locked and all(law.linear for law, *_ in laws)
         """Whether the tangent of the laws depends only on the positions of the points."""
         self.elastic = not any(law.state for law, *_ in laws)
         """Whether no law has a state; only then does the tangent of one substep suit the next."""
@@ -125,24 +134,25 @@ class MomentumForms:
 
     def _forms_of_law(
         self,
-        number: int,
         law: type[Skeleton],
         points: FormPoints,
         locks: bool,
         pressure: fem.Function | None,
+        dried: bool,
         symmetric: bool,
-        given: Mapping[str, fem.Constant],
-    ) -> tuple[ElementForces, ElementMatrices | StackedElementMatrices]:
-        """Return the compiled residual and tangent of a law at its integration points."""
+        dt: fem.Constant,
+    ) -> FormsOfPart:
+        """Return the compiled forms of a law at its integration points; dried: whether any law depends on suction."""
         F = points.deformation(self.u)
-        values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
-        p = None
-        if self._of_suction is not None and "suction" in law.state:
+        values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
+        values |= by_scene(self.grid, None, law, points) | {"dt": dt}
+        p = local = means = None
+        if dried and "suction" in law.state:
             p = ufl.variable(self._retentions.at(pressure, points))
             values["suction"] = ufl.max_value(-p, 0.0)
-        seen = self.dilatation.fbar(points, F) if locks else F
+        seen = self._fbar.of(points, F) if locks else F
         if law.unknowns:
-            self._local[number] = local = LocalUnknowns(law, points, seen, values)
+            local = LocalUnknowns(law, points, seen, values)
             values, known = values | local.values, values | local.known
         else:
             known = values
@@ -150,12 +160,13 @@ class MomentumForms:
         beside = Beside()
         if locks:
             ratio = ufl.det(points.increment(self.u))
-            P, A, beside = self.dilatation.add(law, points, F, seen, ratio, values, known)
+            P, A, beside, means = self._fbar.forms(law, points, F, seen, ratio, values, known)
         else:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
-        if self._of_suction is not None:
-            stress = partial(self.dilatation.by_pressure, law, F, seen) if locks else partial(_by_pressure, law, F)
-            self._of_suction.add(number, points, F, [] if p is None else stress(values, p), locks)
+        slopes = []
+        if p is not None:
+            slopes = self._fbar.by_pressure(law, F, seen, values, p) if locks else _by_pressure(law, F, values, p)
+        sums = suction_sums(points, F, slopes, locks) if dried else None
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
             if self._retentions is not None:
@@ -170,8 +181,8 @@ class MomentumForms:
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
             beside = beside._replace(along=[T * points.F.T for T in beside.along])
-            return residual, ElementMatrices(A, points, symmetric, beside)
-        return residual, StackedElementMatrices(A, points, symmetric, beside)
+            return FormsOfPart(residual, ElementMatrices(A, points, symmetric, beside), local, means, sums)
+        return FormsOfPart(residual, StackedElementMatrices(A, points, symmetric, beside), local, means, sums)
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
         """Return derivatives of nodal forces with respect to cell pressures through suction: `OfSuction.rows`."""
@@ -185,7 +196,7 @@ class MomentumForms:
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the nodal forces that the functions `adders` add, over all processes, as local array; room: buffer."""
+        """Return the nodal forces that `adders` add, summed over processes, a local array; room: index of a buffer."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -201,12 +212,13 @@ class MomentumForms:
         """Return the nodal forces of the stresses at u and of `Loads.takes_up`, N, a local array."""
 
         def solve() -> None:
-            for number, local in self._local.items():
-                local.update(data.parts[number], derive=False)
+            for forms, part in zip(self.law_forms, data.parts, strict=True):
+                if forms.local is not None:
+                    forms.local.update(part, derive=False)
 
         def add(b: NDArray[np.float64]) -> None:
-            for residual, part in zip(self._residuals, data.parts, strict=True):
-                residual.assemble_vector(b, part)
+            for forms, part in zip(self.law_forms, data.parts, strict=True):
+                forms.residual.assemble_vector(b, part)
 
         if self.dilatation is None:
             solve()
@@ -216,14 +228,16 @@ class MomentumForms:
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K; the caller finalises K."""
-        for number, local in self._local.items():
-            local.derive(data.parts[number])
-        sums = [tangent.assemble_matrix(K, part) for tangent, part in zip(self._tangents, data.parts, strict=True)]
+        parts = list(zip(self.law_forms, data.parts, strict=True))
+        for forms, part in parts:
+            if forms.local is not None:
+                forms.local.derive(part)
+        sums = [forms.tangent.assemble_matrix(K, part) for forms, part in parts]
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (nodes,) over the cells at each node; values of owned cells (cells,), or of their nodes."""
+        """Return the sums (nodes,) over the cells at each node; values (cells,), or (cells, 2^d) for their nodes."""
         (shared, values_at), d = self._rooms[0], self.grid.dim
         nodes = self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
@@ -235,7 +249,7 @@ class MomentumForms:
         return values_at[nodes * d]
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
-        """Return the connected parts of the bodies in active cells; of, count: result of `OnGrid.parts_of_cells`."""
+        """Return the connected parts of the bodies; `of` and `count` are the results of `OnGrid.parts_of_cells`."""
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
         own = self.active.now.cells[self.active.now.cells < grid.num_owned]
         total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
@@ -431,7 +445,7 @@ class MomentumProblem:
     @cached_property
     def at(self) -> At:
         """The present displacements."""
-        return At(self.system.unknowns, self.forms.u.x.array)
+        return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
 
     def settle(self, sticks: bool) -> bool:
         """Update stick and slip at u; return whether any state changed; sticks: whether slip may change to stick."""
@@ -460,7 +474,7 @@ class MomentumProblem:
         """Return the out-of-balance nodal forces at u, N, and the force scale (parts,), N, of each connected part."""
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
-        system.held.gather(b, system.held_residual)  # before the penalties, which walls bear for sides next to them
+        system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
         if pulls := [one.pulls for one in self.loads if one.stiff]:
             # not in the scale: at the start of a step they far exceed the forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
@@ -479,7 +493,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and the norms (terms, parts) of its terms, N, as a list."""
+        """Return the result of `unbalanced`, and a list: for each of its terms the norms (parts,), N."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -521,9 +535,9 @@ class MomentumProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two relative residuals of each connected part: without rounding errors, and with them.
 
-        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node,
-        unless `first` is set, so that one solve is made even for a load below the rounding error.  The second result
-        uses scales of at least the rounding error divided by the tolerance.
+        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node.
+        With `first` it includes this error, so that even a load below the error causes a solve.  The second result uses
+        scales of at least the rounding error divided by the tolerance.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

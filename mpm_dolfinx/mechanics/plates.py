@@ -21,7 +21,6 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import RIGIDITY, RigidPlate, Traction, facing, inward
-from mpm_dolfinx.conditions.sides import gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.mechanics.tractions import Tractions
@@ -93,7 +92,7 @@ class Plates(Acting):
             normal = np.tile(np.eye(d)[axis], (len(area), 1))
             tilt = normal - area / area[:, [axis]]  # slope of the face; the face's normal is (-slope, 1)
             rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
-        cell, x, values = gathered(grid, rows, 1 + 2 * d)
+        cell, x, values = grid.gathered(rows, 1 + 2 * d)
         rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
         forms = self._forms(PlateForms)
         data = forms.points.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
@@ -101,7 +100,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep; even: loads of their uniform tractions."""
+    """Plates in a substep; even: loads of the plates' uniform tractions."""
 
     stiff = True
 
@@ -154,5 +153,5 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
         where = "slope" if apart[0] == 0 else f"and {other} are not connected at one height"
         raise ValueError(
             f"{line(plate)}: faces at {one} {where}, must be one flat side normal to an axis; "
-            "use one plate with a region for each"
+            "use one plate with a region for each side"
         )

@@ -29,18 +29,19 @@ The incremental volume ratio of the points has the remaining weight. With nu = 0
 change at a reset of the grid would exceed the stresses in the bodies.
 """
 STIFF_WET = 8
-"""Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies: 1 at nu = 0.43, 0 at 0.47.
+"""Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
 
-The difference between corner-based ratio and Q1 field expels water from such skeletons in every step of any length.
-With a weight of 1 and eight cells across its depth, the extreme pressures of a beam have errors of 43 % at nu = 0.49.
-At 0.499 the pressures are six to thirty times too large, and adaptive steps never grow.
+The weight is 1 at nu = 0.43, and 0 at 0.47.  The difference between corner-based ratio and Q1 field expels water from
+skeletons above this value in every step of any length.  With a weight of 1, the extreme pressures of a beam with eight
+cells across its depth have errors of 43 % at nu = 0.49.  At 0.499 they are six to thirty times too large, and adaptive
+steps never grow.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
 
-Dilatant flow has a volume strain rate of sin psi times its shear rate. At four points it over-constrains a Q1 cell,
-even with F-bar. For a footing with associated flow, phi = 20 degrees, on 9 and 17 cells, the load is then 4.4 and 3.4 %
-too large, and still rises. With one point per cell it is 6.6 and 3.2 % too small, and constant.
+Dilatant flow has a volume strain rate of sin psi times its shear rate. This condition at four points over-constrains a
+Q1 cell, even with F-bar. For a footing with associated flow, phi = 20 degrees, on 9 and 17 cells, the load is then 4.4
+and 3.4 % too large, and still rises. With one point per cell the load is 6.6 and 3.2 % too small, and constant.
 """
 
 
@@ -212,7 +213,7 @@ class QuadraturePoints:
         """Return the data of material points that change from step to step."""
         fields = {"F": points.F, **self._scene.state(points)}
         fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
-        if self._extended:  # `_constant` has fields of laws for all materials; `data` only at points of their own
+        if self._extended:  # fields of laws are in `_constant`; in `data` each is valid only at points of its own law
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:
             fields["storage"] = self._scene.storage(points)
@@ -261,11 +262,11 @@ class QuadraturePoints:
         return self._scene.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return two numbers (m, 2) for each integration point, equal for points that conduct alike."""
+        """Return two numbers (m, 2) of each integration point: both are equal at points with equal conductivity."""
         return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta of the fixed-stress operator at the integration points, 1/Pa, without the scheme's factor.
+        """Return beta (m,), 1/Pa, at the integration points: fixed-stress operator C + factor beta V.
 
         of_fluid: return 1/K_w instead of beta; the iteration then converges for stiff skeletons only.
         """

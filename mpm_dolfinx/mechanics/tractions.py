@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. That of a pressure
-is -int p n . v da on the present area. The tangent of this term is symmetric except for the edges dx of the surface,
-which contribute p/2 (v x du) . dx. This contribution vanishes where two surfaces of equal pressure meet. It also
+The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. The virtual work of
+a pressure is -int p n . v da on the present area. The tangent of this term is symmetric except for a contribution p/2
+(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. It also
 vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
 """
 
@@ -25,11 +25,10 @@ from mpm_dolfinx.base.validation import by_place
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import Pressure, Traction
-from mpm_dolfinx.conditions.sides import everywhere, on_side
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.grid.grid import SIDES, Grid
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -60,7 +59,7 @@ class SideLoads(Acting):
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
-        values = everywhere(grid, lambda: [self._given(of, place.t, on_side(p, place.points)) for of, p in both])
+        values = everywhere(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
         forces = [self._on(of, value, p, place.points) for (of, p), value in zip(both, values, strict=True)]
         return places, travel.send(np.concatenate(forces))
 
@@ -124,7 +123,7 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
 
 
 class PressureForms:
-    """Forms of nodal forces and minus their derivative, from a pressure force on the area at the step's start."""
+    """Forms of nodal forces of pressures, and of minus their derivative; `push`: force on the area at the start."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -179,7 +178,7 @@ class PressureLoads(Loads):
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether each surface of equal pressure is closed, or ends on walls that fix their normal component.
+    """Return whether each surface of equal pressure is closed, or ends on walls that fix the normal displacement.
 
     A surface counts as open if corners of its faces lie on the edges of other faces.
 
@@ -201,7 +200,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
 
 def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
-    """Return axis and position, m, of each wall that fixes its normal displacement component."""
+    """Return axis and position, m, of each wall that fixes the displacement component normal to the wall."""
     out = []
     for wall, (axis, end) in SIDES[grid.dim].items():
         if not over_all(grid.comm, int(free[grid.wall_nodes(wall), axis].sum())):

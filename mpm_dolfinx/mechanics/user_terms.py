@@ -17,7 +17,6 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, FormsOf, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import OnSide
-from mpm_dolfinx.conditions.sides import gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.materials.user_functions import compiling, term_of
 
@@ -101,7 +100,7 @@ class OwnTermsOfStage(Acting):
         area, now = p.area(place.points), p.now(place.points)
         size = np.linalg.norm(area, axis=1, keepdims=True)
         rows = np.concatenate([size, area / size, now, now - p.origin(place.points)], axis=1)
-        cell, x, values = gathered(self._grid, [(p.cell, p.x, rows)], 1 + 3 * self._grid.dim)
+        cell, x, values = self._grid.gathered([(p.cell, p.x, rows)], 1 + 3 * self._grid.dim)
         normal, position, displacement = np.split(values[:, 1:], 3, axis=1)
         return of.at(cell, x, values[:, 0], normal=normal, position=position, displacement=displacement)
 

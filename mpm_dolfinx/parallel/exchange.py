@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Exchange of array rows between processes, and of the answers to these rows.
 
-A row is the data of one piece of a particle domain, corner or loaded point.  It is sent to the process that owns its
-cell, which assembles the integrals of the cell.  A single process copies nothing.
+A row is the data of one piece of a particle domain, of one corner or of one loaded point.  The row is sent to the
+process that owns its cell and assembles the integrals of the cell.  A single process copies nothing.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Exchange:
         received, first_there = np.empty_like(sent), np.empty_like(sent)
         comm.Alltoall(sent, received)
         comm.Alltoall((np.cumsum(received) - received).astype(np.int32), first_there)
-        place = np.empty(len(destination), dtype=np.int32)  # index of each row among all rows its process receives
+        place = np.empty(len(destination), dtype=np.int32)  # index of each row among all rows that its receiver gets
         place[order] = np.arange(len(destination)) + np.repeat(first_there - (np.cumsum(sent) - sent), sent)
         self._counts = len(destination), int(received.sum())
         self._away = tuple(np.delete(counts, comm.rank) for counts in (sent, received))
@@ -75,7 +75,7 @@ class Exchange:
         rows = np.ascontiguousarray(rows)
         out = np.empty((self._counts[to], *rows.shape[1:]), dtype=rows.dtype)
         width = int(np.prod(rows.shape[1:], dtype=int))
-        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # entries may be more than an int counts
+        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # the entries may be too many for an int
         away = self._away[1 - to]
         traffic.transfers += 1
         traffic.messages += int(np.count_nonzero(away))
@@ -105,6 +105,18 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 def first(comm: MPI.Intracomm, message: str) -> str:
     """Return the first non-empty message of all processes, so that all can raise the same error."""
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
+
+
+def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
+    """Return the values of user functions on this process.  An error on one process is raised on all processes."""
+    message, value = "", None
+    try:
+        value = ask()
+    except ValueError as error:
+        message = str(error)
+    if message := first(comm, message):
+        raise ValueError(message)
+    return value
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:

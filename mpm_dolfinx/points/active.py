@@ -20,8 +20,8 @@ class ActiveSet:
     """The active cells of a grid, and quantities derived from them."""
 
     grid: Grid
-    cells: NDArray[np.int64]  # local numbers, ascending, with ghosts
-    nodes: NDArray[np.int64]  # local numbers of nodes of active cells on any process, ascending, with ghosts
+    cells: NDArray[np.int64]  # local indices, ascending, with ghosts
+    nodes: NDArray[np.int64]  # local indices of nodes of cells that are active on any process, ascending, with ghosts
 
     @cached_property
     def dofs(self) -> NDArray[np.int64]:

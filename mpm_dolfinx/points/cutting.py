@@ -5,9 +5,9 @@ A material point has a quadrilateral or hexahedral domain with tracked corners. 
 centroids, in 3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear.
 One quadrature point per piece therefore integrates these gradients exactly, wherever the domain lies on the grid.
 
-The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  They match the triangles of
-the neighbours, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives the
-volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
+The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles match those of
+neighbouring domains, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives
+the volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
 interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
 
 In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, sum_by
 
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
@@ -39,38 +39,19 @@ class Pieces:
     """Pieces of particle domains; arrays for m pieces, ordered by point and cell."""
 
     point: NDArray[np.int64]  # (m,) index of the domain
-    cell: NDArray[np.int64]  # (m,) lexicographic number of the cell
+    cell: NDArray[np.int64]  # (m,) lexicographic index of the cell
     fraction: NDArray[np.float64]  # (m,) volume of the piece / volume of the domain
     x: NDArray[np.float64]  # (m, d) centroid, m
     # (m, d, 2) on request, else (m, 0, 2): area on the lower and upper face of the cell along each axis, m^(d-1)
     faces: NDArray[np.float64]
     # (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the two other axes, m^2
     mixed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-    # (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean
-    # product of the components of this offset, m^2; radius of this centroid, m
+    # (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean over
+    # the section of the product of both offsets from this midpoint, m^2; radius of the section's centroid, m
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     # (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces
     # with symmetric sections
     second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-
-
-def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the ends (2^d, d) of the domain's corners along each axis: 0 lower, 1 upper."""
-    return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
-
-
-def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the indices (2d, 2^(d-1)) of the corners of a domain's faces; face 2 a + e is at end e of axis a."""
-    bits = corner_bits(dim)
-    return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
-
-
-FACES = {d: _faces(d) for d in (2, 3)}
-"""Indices (2d, 2^(d-1)) of the corners of a domain's faces."""
-FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
-ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
 
 @cache
@@ -104,7 +85,7 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains; v (v, d, n): the result of `vertices`."""
+    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): the m vertices by `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
@@ -146,7 +127,7 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
 
 
 def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edges (n, d, d), m, as columns, of domains with corners (n, 2^d, d)."""
+    """Return the mean edge vectors (n, d, d), m, as columns, of domains with corners (n, 2^d, d)."""
     signs = 2.0 * corner_bits(corners.shape[2]) - 1
     return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
@@ -169,7 +150,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains are inverted, as the volume between their corners is far from their `volume` (n,)."""
+    """Return which domains are inverted: the volume between their corners is far from `volume` (n,), m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -183,7 +164,7 @@ def parallelepipeds(
 
 
 def _chunks(count: int, dim: int) -> list[slice]:
-    """Return slices of `count` domains whose simplices fit into the processor's cache."""
+    """Divide `count` domains into slices, each so small that its simplices fit into the processor's cache."""
     size = CHUNK // len(simplices(dim))
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
@@ -213,14 +194,14 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in cells and positions for slicing, both snapped to grid planes nearer than `Grid.snap`.
+    """Return positions in units of cells, and for slicing; both are snapped to grid planes nearer than `Grid.snap`.
 
-    Edges of domains are straight in metres. On equal cells the positions for slicing are in cells, else in metres.
+    Positions for slicing: in units of cells if all cells are equal, else in m, because domain edges are straight in m.
 
     Parameters
     ----------
     true, x, axes
-        Positions from the grid's lower corner, in cells; the same from the base, m; array axis of components.
+        Positions from the grid's lower corner, in units of cells; the same from the base, m; array axis of components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -234,7 +215,7 @@ def on_planes(
 
 
 def slices_in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return slices (d, k, m), each in one cell, as positions in cells from the grid's lower corner."""
+    """Return slices (d, d, m), each within one cell, as distances from the grid's lower corner in units of cells."""
     if grid.even:
         return s
     out = s.copy()
@@ -461,7 +442,8 @@ def _rings(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return radii (m,), m, volume centroids (m, 2), from 0 to 1 in their cells, and `hoop` of pieces, see `Pieces`.
 
-    cell (m, 2): indices; c (m, 2): area centroids, from 0 to 1; squares, products (m,): means of r^2 and r z.
+    cell (m, 2): grid indices of the pieces' cells.  With coordinates r, z from 0 to 1 in the cell: centroid c (m, 2) of
+    the section; squares, products (m,): means of r^2 and r z over the section.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
     squares = np.minimum(np.maximum(squares, x**2), x)  # rounding may violate these bounds in very thin pieces
@@ -485,14 +467,9 @@ def _products(
 ) -> list[NDArray[np.float64]]:
     """Return the integrals over the pieces of products of two coordinates, from the lower corners of their cells.
 
-    Parameters
-    ----------
-    pairs
-        Axes of the two coordinates, ascending.
-    x, sums, area
-        Vertices (d, d, m) of slices, their sums (d, m), and areas (m,) of slices, projected along the first axis.
-    pair, total
-        Functions: sum over the vertices of slices of the product of two coordinates; sum of slice values in each slot.
+    pairs: axes of the two coordinates, ascending.  x, sums, area: vertices (d, d, m) of slices, their sums (d, m), and
+    areas (m,) of slices, projected along the first axis.  pair, total: functions that return the sum over the vertices
+    of slices of the product of two coordinates, and the sum of slice values in each slot.
     """
     d = len(x)
 
@@ -534,8 +511,8 @@ def cut_faces(
 
     Returns
     -------
-    Face (n,), position (n, d), interpolated coordinates (n, e) and fraction of the face (n,) of each point; middle (n,
-    d) of the face's part in the cell of the point.
+    For each point: index of its face (n,), position (n, d), interpolated coordinates (n, e), the fraction of the face
+    that it represents (n,), and the middle (n, d) of its segment or triangle, a part of the face in one cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -580,12 +557,8 @@ def _polygons(
 
     The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
-    Parameters
-    ----------
-    s : (3, a, n)
-        Corners of the slices: first positions for slicing, last barycentric coordinates in the triangle.
-    owner : (n,)
-        Index of the triangle of each slice.
+    s (3, a, n): corners of the slices, first positions for slicing, last barycentric coordinates in the triangle; owner
+    (n,): index of the triangle of each slice.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
@@ -623,7 +596,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of the next member of each member's group, cyclically; group (n,): group, ascending."""
+    """Return the index of each member's successor in its group, the first after the last; group (n,): ascending."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 RADIUS = 3.0
 """Offset beyond which the weight is zero, in spacings of the data.
 
-Source: exact, because at an end of the data the points at 0.5, 1.5 and 2.5 have weight, as many as a parabola needs.
+Source: exact. A parabola needs three points: at an end of the data these are at offsets of 0.5, 1.5 and 2.5.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
 """Weights of the coefficients of degrees 0, 1, 2, relative to the data; they affect only undetermined coefficients.

@@ -24,7 +24,7 @@ ACROSS = "stretch across"
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the body (n,) of each point by its id; starts (bodies + 1,): first id of each body, and of renewed points.
+    """Return the index (n,) of each point's body; starts (bodies + 1,): first id of each body, and of renewed points.
 
     Ids of renewed points belong to the bodies in turn.
     """
@@ -56,10 +56,17 @@ def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3) from its scaled in-plane part (n, 2, 2), with det F, and the out-of-plane stretch (n,)."""
+    """Return F (n, 3, 3) from its in-plane part (n, 2, 2), scaled to det F, and the out-of-plane stretch (n,)."""
     out = np.zeros((len(F), 3, 3))
     out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
     out[:, 2, 2] = across
+    return out
+
+
+def unstretched(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return F (n, 3, 3), without stretch out of plane if F is (n, 2, 2)."""
+    out = np.tile(np.eye(3), (len(F), 1, 1))
+    out[:, : F.shape[1], : F.shape[1]] = F
     return out
 
 
@@ -86,9 +93,9 @@ class MaterialPoints:
     Attributes
     ----------
     id : (n,)
-        Number of the point, unique in a scene.
+        Identifier of the point, unique in a scene.
     corners : (n, 2^d, d), m
-        Tracked corners of the particle domain, in the order of `cutting.corner_bits`.
+        Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
         Deformation gradient; in plane strain with an out-of-plane stretch only its in-plane part, scaled to det F.
     volume0 : (n,), m^d
@@ -96,7 +103,7 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: mean over the domain, of second order. Cells and pieces have their own.
+        Pore pressure, positive in compression: mean over the domain, second-order accurate; balances use the cells'.
     x : (n, d), m
         Centroid of the domain, in axisymmetry of its section. F and pressure are exact there for linear fields.
     origin : (n, 2^d, d), m
@@ -232,7 +239,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: values.copy() for name, values in self.data.items()})
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return which entries of `ids` are points of this process, as indices, and the indices of these points."""
+        """Return the indices of entries of `ids` that are points of this process, and the indices of these points."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)

@@ -15,9 +15,8 @@ from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, corner_bits
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import corner_bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +26,12 @@ class Parts:
     count: int  # number of parts
     cells: NDArray[np.int64]  # part of each active local cell, from 0, else -1
     nodes: NDArray[np.int64]  # part of each active local node, from 0, else -1
+
+    def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the largest values (count, ...) in each part, of values (n, ...) in parts (n,); else -inf."""
+        out = np.full((self.count, *values.shape[1:]), -np.inf)
+        np.maximum.at(out, part, values)
+        return over_all(comm, out, MPI.MAX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +76,31 @@ class OfParts:
         return self.sums(np.ones(len(self.of)))
 
 
+def largest_of_bodies(
+    comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
+
+    Parameters
+    ----------
+    comm
+        The processes.
+    part : (m,)
+        Connected part of each value, from 0.
+    values : (k, m)
+        Values of this process.
+    inside : (bodies, parts)
+        Whether this process has points of the body in the part.
+    """
+    largest = np.full((len(values), inside.shape[1]), -np.inf)
+    for row, found in zip(values, largest, strict=True):
+        np.maximum.at(found, part, row)
+    together = over_all(comm, np.concatenate([largest, inside]), MPI.MAX)
+    largest, inside = together[: len(values), None], together[len(values) :] > 0
+    found = np.where(inside, largest, -np.inf).max(axis=2, initial=-np.inf)
+    return np.where(inside.any(axis=1), found, 0.0)
+
+
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
@@ -103,12 +133,23 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
     return out, count
 
 
+def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the connected part (n,), from 0, of domains with corners (n, 2^d, d), m, in copies of the grid (n,)."""
+    cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
+    cell, at = np.unique(cell, return_inverse=True)
+    own, count = _touching(
+        np.stack([*np.unravel_index(cell % grid.cells, tuple(grid.shape)), cell // grid.cells], axis=1)
+    )
+    of = own[at.reshape(corners.shape[:2])]
+    return _joined(np.repeat(np.arange(len(of)), of.shape[1]), of.ravel(), (len(of), count))[0]
+
+
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
     """Return the parts of cells and their number, as `parts_of_cells`, with the parts of some pairs of cells joined.
 
-    pairs (m, 2): active lexicographic cells; each process may have some. All processes must call it.
+    pairs (m, 2): lexicographic indices of active cells; each process may have some. All processes must call it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.local(cells)], 0)
@@ -119,7 +160,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part (n,), from 0, of cells by indices and copy (n, d + 1), and the number of parts."""
+    """Return the part (n,), from 0, of each cell, and the number of parts; index (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -142,10 +183,10 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return for each cell the number of its connected part, counted over all processes, and the number of parts.
+    """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
 
-    own, count: part of each cell, and number of parts, counted on this process alone; nodes, of_node (n,): local
-    numbers of the cells' nodes, and part of each node on this process.
+    own, count: part of each cell, and number of parts, on this process alone; nodes, of_node (n,): local indices of the
+    cells' nodes, and part of each node on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NONE = -1
-"""Value in `Polygons.edge` for edges without a number."""
+"""Value in `Polygons.edge` for edges without an identifier."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class Polygons:
 
     x: NDArray[np.float64]  # (n, k, 2) vertices, m, padded by the last vertex
     count: NDArray[np.int64]  # (n,) number of vertices
-    edge: NDArray[np.int64]  # (n, k) number of the edge from each vertex to the next; cuts preserve it
+    edge: NDArray[np.int64]  # (n, k) identifier of the edge from each vertex to the next; cuts preserve it
 
     @classmethod
     def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:
-        """Return polygons with k vertices each, x (n, k, 2); by default their edges (n, k) have no numbers."""
+        """Return polygons with k vertices each, x (n, k, 2); by default their edges (n, k) have no identifiers."""
         n, k = x.shape[:2]
         return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
 
@@ -59,7 +59,7 @@ class Polygons:
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
         """Return the part of each polygon where normal . x <= level; normal (n, 2), level (n,).
 
-        The algorithm is that of Sutherland and Hodgman (1974). New edges have no number.
+        The algorithm is that of Sutherland and Hodgman (1974). New edges have no identifier.
         """
         n, k = self.edge.shape
         used = np.arange(k) < self.count[:, None]
@@ -101,8 +101,8 @@ class Polygons:
 
         Returns
         -------
-        Index of the polygon (m,), vertices (m, 4, 2) and edge numbers (m, 4) of each quadrilateral.  In a triangle the
-        middle of the longest edge is the fourth vertex.
+        For each quadrilateral: index of its polygon (m,), vertices (m, 4, 2) and edge identifiers (m, 4).  In a
+        triangle the middle of the longest edge is the fourth vertex.
         """
         left, rows = self, np.arange(len(self.count))
         found = []
@@ -123,7 +123,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Cut a quadrilateral off each polygon with n > 4 vertices, a triangle off pentagons; return both parts."""
+        """Cut a triangle off pentagons, a quadrilateral off polygons with more vertices; return both parts."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
@@ -142,7 +142,7 @@ class Polygons:
         return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], rest)
 
     def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return triangles as vertices (n, 4, 2) and edge numbers (n, 4), with the middle of the longest edge."""
+        """Return triangles as vertices (n, 4, 2) and edge identifiers (n, 4), with the middle of the longest edge."""
         size = np.linalg.norm(self.after - self.x, axis=2)
         order = (size.argmax(axis=1)[:, None] + np.arange(3)) % 3
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)

@@ -15,9 +15,9 @@ EDGES = 4
 "flow" in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
-"""Deviation of the surface from a chord, in cells, above which it has a corner; flatter parts are divided evenly.
+"""Deviation of the surface from a chord, in cell sizes, above which it has a corner; flatter parts are divided evenly.
 
-Source: exact, a chord of one cell in a circle of a cell's radius: the grid cannot resolve a smaller circle.
+Source: exact, for a chord of one cell size in a circle of this radius: the grid cannot resolve a smaller circle.
 """
 RING = np.array([0, 1, 3, 2])
 """Corners of a particle domain, anti-clockwise."""
@@ -32,7 +32,7 @@ class Region:
     Parameters
     ----------
     cells
-        Local numbers of the cells.
+        Local indices of the cells.
     surface : (n, EDGES + 1, 2)
         Vertices of the surface in each cell, from entry to exit, with the body on the left.
     """
@@ -41,7 +41,7 @@ class Region:
         self.cells = cells
         edges = surface.shape[1] - 1
         most = edges + 10  # plus corners and midpoints of the cell's sides, and one more vertex
-        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in half sides of the cell
+        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in units of half a side of the cell
         end = np.where(end <= start + NEAR, end + 8, end)
         first = np.floor(start + NEAR).astype(np.int64) + 1
         count = np.maximum(0, np.ceil(end - NEAR).astype(np.int64) - first)
@@ -106,7 +106,7 @@ def resampled(
 
     The area between surface and chord is preserved: vertices are shifted to restore the lost area.
 
-    of (m,), x (m, 2, 2): cell of each segment of the given surfaces, in order, and the ends of the segment.
+    of (m,), x (m, 2, 2): for each segment of the given surfaces the index of its cell, ascending, and both its ends.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])
@@ -134,7 +134,7 @@ def resampled(
         out[:, middle] = (place(target - NEAR) + place(target + NEAR)) / 2  # the same result from both ends
 
     def place(target: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (n, 2), in cells, at arc lengths `target` (n,) along the segments."""
+        """Return the positions (n, 2), from 0 to 1 in each cell, at arc lengths `target` (n,) along the segments."""
         part = np.clip(np.searchsorted(arc, target, side="right") - 1, first, stop - 1)
         t = (target - arc[part]) / np.maximum(length[part], TINY)
         return x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
@@ -163,7 +163,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance, from 0 to 4, of positions (n, 2) on the border of the unit square, anti-clockwise."""
+    """Return the distances (n,), 0 to 4, of positions (n, 2) from (0, 0), anti-clockwise along the unit square."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)

@@ -3,7 +3,7 @@
 
 A piece has storage s (m^d/Pa) and pore volume n (m^d).  Its fluid content minus that at zero pressure is
 c(p) = s pi(p) + n (S(p) - 1) rho(p), with the mass potential pi and the density rho relative to zero pressure.  In a
-piece away from its cell's centroid the pressure is p + o, with an offset o; soils differ in S.
+piece away from its cell's centroid the pressure is p + o, with an offset o.  S depends on the soil of the piece.
 """
 
 from __future__ import annotations

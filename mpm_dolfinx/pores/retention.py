@@ -250,9 +250,9 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of the materials, as UFL expressions of data at the integration points.
 
-    The points' field `retention` is a vector: the number of the law's class (1, 2, ...), then its constants.  The
-    number is 0 if the pores stay saturated.  Pieces also have the field `lever`, the vector from the centroid of the
-    material in their cell.  The pressure in a piece is the cell pressure plus the hydrostatic difference along `lever`.
+    The points' field `retention` is a vector: the index of the law's class (1, 2, ...), then the law's constants.  The
+    index is 0 if the pores stay saturated.  Pieces also have the field `lever`: the vector to the piece from the
+    centroid of the material in its cell.  The piece's pressure is the cell's, plus the hydrostatic rise along `lever`.
 
     Parameters
     ----------
@@ -287,11 +287,11 @@ class Retentions:
         return out
 
     def number(self, law) -> int:
-        """Return the number of a law among all laws (1, 2, ...); 0 for None."""
+        """Return the index of a law among all laws (1, 2, ...); 0 for None."""
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return hydrostatic pressure differences to the cell (m,), Pa; lever (m, d): vectors from the centroid, m."""
+        """Return pressure of each piece (m,) minus pressure of its cell, Pa; lever (m, d), m: see the class."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
@@ -360,10 +360,8 @@ class SaturationAt:
 
     Parameters
     ----------
-    grid
-        Background grid.
-    retentions
-        Retention curves of the scene.
+    grid, retentions
+        Background grid, and retention curves of the scene.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -396,10 +394,8 @@ class Conductance:
 
     Parameters
     ----------
-    grid
-        Background grid.
-    law
-        The retention curve.
+    grid, law
+        Background grid, and the retention curve.
     """
 
     def __init__(self, grid: Grid, law):
@@ -420,7 +416,7 @@ class Conductance:
         self._edges = edges
 
     def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the integral, Pa, k_r, and its derivative, 1/Pa, (n, 3) at pressures p (n,), Pa."""
+        """Return three columns (n, 3) at pressures p (n,), Pa: integral, Pa; k_r; derivative of k_r, 1/Pa."""
         s = np.clip(-p, self._edges[0], self._edges[-1])
         z = (np.log(s) - self._low) / self._step
         i = np.minimum(z.astype(np.int64), ROWS - 2)
@@ -441,7 +437,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of suctions in the table, divided by the law's scale.  Source: beyond it exact up to a fraction of 1e-8."""
+"""Range of suctions in the table / the law's scale.  Source: beyond it the integral is exact to a fraction of 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Halving this value changes the result of scene "dry" in tests/plateaus.py by 2.1e-08
 (relative), doubling it by 2.6e-09, and finer cells by 6.6e-03.
@@ -481,9 +477,9 @@ def restrained(
 ) -> NDArray[np.float64]:
     """Return the pressure decreases (n,), Pa, of a Newton step after limitation.
 
-    A step ends at the characteristic suction.  On each side of this suction the saturation is convex or concave, so
-    Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at most `FARTHEST`.  If the
-    direction reverses, the change is at most half of the previous change, which prevents oscillations.
+    A step across the characteristic suction ends there.  On each side of this suction the saturation is convex or
+    concave, so Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at most
+    `FARTHEST`.  If the direction reverses, it changes by at most half of its previous change: no oscillations.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ class CellFields:
     Attributes
     ----------
     cell : (n,)
-        Local number of the cell in the grid's mesh.
+        Local index of the cell in the grid's mesh.
     x : (n, d), m
         Centroid of the material in the cell.
     volume : (n,), m^d

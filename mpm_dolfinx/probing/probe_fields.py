@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`LocalFit`).
 
-The fit uses the cells within three cells of the probe's cell along each axis, if open faces connect them to it.  Their
-soil must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the
+The fit uses cells that open faces connect to the probe's cell, at most three cells away along each axis.  Their soil
+must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the
 face pressure of the two-point flux.  On drained sides it uses the prescribed pressure.  Heads are fitted instead of
 pressures, so hydrostatic states are exact.  The heads of the probe's cell, of its neighbours and of the cell's drained
 sides bound the result.  Towards an undrained side the bound is extrapolated with the slope of the adjacent cells.
@@ -44,7 +44,7 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 class _Lattice:
     """Blocks of (2 CELLS + 1)^d cells around the cells of m probes.
 
-    number (m, cells): lexicographic numbers, -1 outside the grid; midpoint, size (m, cells, d), m.
+    number (m, cells): lexicographic indices of the cells, -1 outside the grid; midpoint, size (m, cells, d), m.
     middle: index of the probe's cell in its block; stride (d,): increment of this index along each axis.
     neighbours: for each axis and end, indices in the block of cells with a neighbour there, and of these neighbours.
     """
@@ -73,8 +73,8 @@ class _Lattice:
 class _Around:
     """Data of the cells around m probes, equal on every process; arrays (m, cells, ...).
 
-    p: pressure, Pa; centroid (d,), m: vector from the probe; half (d,), m: vector from the cell's midpoint to it.
-    open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: see `_connected`.
+    p: pressure, Pa; centroid, half (d,), m: vectors to the material's centroid from the probe and from the cell's
+    midpoint; open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: `_connected`.
     """
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
@@ -104,10 +104,10 @@ class _Around:
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Return the local numbers (m, cells) of owned cells, -1 for others, and the data of all cells.
+        """Return the local indices (m, cells) of owned cells, -1 for others, and the data of all cells.
 
         p: pressures of the filled owned cells, Pa; soils (k, 3): conductivity, its law and material of the pieces.
-        Data columns: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan for several), open fractions.
+        Data columns: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan if not unique), open fractions.
         """
         grid = self._grid
         contents = self._contents
@@ -134,7 +134,7 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which cells (m, cells) the fit uses, and which are connected to the probe's cell by open faces.
 
-        If no cell contains only the probe's soil, as in thin layers, the fit uses cells of its material, or else all.
+        If no cell has only the probe's soil, as in thin layers, the fit uses cells with only its material, or else all.
 
         same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """
@@ -232,7 +232,7 @@ class _Around:
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
         """Return probes, offsets, heads and weights at drained sides in the fit, and which are in the probe's cell.
 
-        Each side of a cell gives the fit one head, the mean over its faces. Separate heads would cause false gradients.
+        For each side of a cell, the fit uses the mean head over the side's faces: single heads cause false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))

@@ -15,9 +15,8 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import all_of, flag, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import interpolate
-from mpm_dolfinx.grid.grid import in_chunks, rounding
+from mpm_dolfinx.grid.grid import corner_bits, in_chunks, rounding
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -35,7 +34,7 @@ class Probes:
         """Raise ValueError if the scene has other bodies, or if a probe is in an absent body."""
         if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
-            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
+            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in the scene's order")
         body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
         absent = np.flatnonzero(~np.asarray(present)[body])
         if len(absent):
@@ -104,7 +103,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     Raises
     ------
     ValueError
-        A position is outside the bodies.  A run raises it for bodies that are not the scene's, or absent.
+        A position is outside the bodies.  A run raises ValueError if the scene has other bodies, or a body is absent.
     """
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)

@@ -80,9 +80,9 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`; None without an event.
 
-        Trial steps start from the same state. Brent's method chooses their lengths for numbers, bisection for booleans.
-        The result is the first state that they find after the event, at most the fraction `LOCATED` of the step later.
-        The simulation then has the state at the start of the step again, even after an error.
+        Trial steps of other lengths start from `step.start`. Brent's method chooses the lengths for functions that
+        return numbers, bisection for booleans. The result is the first state found after the event, at most the
+        fraction `LOCATED` of the step later. Finally the simulation has the state `step.start`, even after an error.
         """
         if not self._until:
             return None

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.errors import Report, StepFailed, raise_interrupt
 from mpm_dolfinx.base.validation import instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
-from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
+from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.contact.groups import grouped
 from mpm_dolfinx.diagnostics.resolution import warn_thin
-from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
+from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, check_parts
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
@@ -185,7 +185,7 @@ class Simulation:
     def reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain), in the last step.
 
-        In axisymmetry for the full circumference, radial forces outward; nan before the first step of a stage.
+        In axisymmetry: of the full circumference, radial component positive outward. Before a stage's first step: nan.
         """
         return self.outcome("reactions")
 

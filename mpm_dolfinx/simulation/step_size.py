@@ -20,9 +20,8 @@ from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
-from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Smallest reduced step / nominal step, for equal steps and for adaptive steps.
@@ -35,9 +34,9 @@ FINEST = NEAR**2
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Next adaptive step / last one: SAFETY / (a root of the relative error), from SHRINKS to GROWS; 1 instead if < KEEPS.
+"""Next adaptive step / last one: SAFETY / (a root of the relative error), in [SHRINKS, GROWS]; 1 instead of [1, KEEPS).
 
-Source: Hairer, Norsett and Wanner (1993), eq. 4.13; the last Hairer and Wanner (1996), IV.8.
+Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for KEEPS Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
 """Sudden pressure change / largest change so far, above which two steps of half the length replace a step.
@@ -45,7 +44,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""Ratio of sudden pressure changes per time, in successive steps, up to which the later change is no jump."""
+"""A sudden pressure change up to this multiple of the one in the previous step, both per time, is no jump."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
@@ -147,7 +146,8 @@ class StepSize:
         A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
         jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
         """
-        return report.sudden - AGAIN * control.first * size > RINGS * control.change
+        excess = report.sudden - AGAIN * size * np.asarray(control.first)
+        return bool((excess > RINGS * np.asarray(control.change)).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
         """Return (length of a step with the tolerated error) / (length of the solved step)."""
@@ -158,12 +158,12 @@ class StepSize:
         """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content.
 
         The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
-        pressures follow the motion. Their error due to the step affects no motion. The grid's error, some percent, does
-        not fall with the step.
+        pressures follow the motion. The time error of such pressures affects no motion. Their error due to the grid,
+        some percent, does not fall with the step.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
-        allowed = self.rtol * max(control.change, report.sealed)
+        allowed = self.rtol * max(*control.change, report.sealed)
         wrong, filled = report.fills
         errors = [
             (report.error, allowed),
@@ -173,13 +173,16 @@ class StepSize:
         return max(off / least if least > 0 else 0.0 if off == 0 else inf for off, least in errors)
 
 
-def measured(control: StepControl, report: Report, result: Result) -> StepControl:
-    """Return the step control with the largest changes of pressure, motion and water content so far."""
-    change = max(control.change, report.change, NEAR * report.stress)
-    if len(result.rows) and len(start := result.pressure[0]) and report.extremes is not None:
-        change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start.tolist(), strict=True)))
+def measured(control: StepControl, report: Report) -> StepControl:
+    """Return the step control, updated with the largest changes of pressure, motion and water content so far."""
+    change = np.maximum(np.maximum(control.change, report.change), NEAR * report.stress)
+    start = control.start
+    if report.extremes is not None:
+        start = report.extremes[0].tolist() if start is None else start
+        change = np.maximum(change, np.abs(report.extremes[1] - start).max(axis=0))
     motion = None if control.motion is None else max(control.motion, report.moves[1])
-    return replace(control, change=change, motion=motion, filled=max(control.filled, report.fills[1]))
+    filled = max(control.filled, report.fills[1])
+    return replace(control, change=change.tolist(), start=start, motion=motion, filled=filled)
 
 
 class Times:
@@ -281,7 +284,8 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
-        raise ValueError(f"rtol = {line(rtol)}: without flow velocities have no error estimate, must be dt alone")
+        why = "without flow of fluid, velocities have no error estimate"
+        raise ValueError(f"rtol = {line(rtol)}: {why}, must be dt alone")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error

@@ -49,11 +49,11 @@ WIDER, WIDEST = 2**0.5, 16.1
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
-A trial that slides starts with an overload of 0.9 of the missing strength in a uniform block, and of 0.6 in a slope.
+A trial that slides starts with an overload of 0.9 times the missing strength in a uniform block, 0.6 times in a slope.
 By the end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the elastic strain at yield, or by a smaller overload.
+"""Strain in a trial of a marginal slide, divided by the smaller of its overload and the elastic strain at yield.
 
 Stresses of soil that begins to flow redistribute within a few strains at yield.  In soft soil such strains would change
 the shape of the body, so the viscosity is larger there.  If this number is halved or doubled, the factor of a slope
@@ -89,8 +89,8 @@ def factor_of_safety(
     """Return the factor of safety by strength reduction: the largest divisor of the strength without failure.
 
     The simulation is unchanged. A scene that cannot stand need not be run: trials start from an elastic step of dt.
-    Suction, as part of the effective stress, is strength. Tool friction is not divided. If a thin weak layer at the
-    surface slides alone, the factor depends on `rtol`, by its share of the load. All processes must call the function.
+    Suction, as part of the effective stress, adds to the strength. Tool friction is not divided. If a thin weak surface
+    layer slides alone, the factor depends on `rtol`, by the layer's share of the load. All processes must call it.
 
     Parameters
     ----------
@@ -105,11 +105,6 @@ def factor_of_safety(
         Largest number of steps in a trial, >= 8; bodies that move after these steps slide.
     progress
         Whether to show a progress bar on a terminal.
-
-    Returns
-    -------
-    Safety
-        The factor, its bounds and the overloads of all trials.
 
     Raises
     ------
@@ -290,7 +285,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step, divided by the work of the shear stress (of magnitudes).
+        """Return (work of the viscous stress in a step) / (integral of the norms of deviatoric stress x strain).
 
         Points that moved to another process are excluded.
         """
@@ -312,7 +307,7 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress, Pa; ValueError if coordinate rounding causes as large a stress."""
+    """Return the volume mean of the norm of effective stress, Pa; ValueError if rounding alone may cause this mean."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -325,7 +320,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of the shear moduli, Pa, of soil with a strength, because soft soil flows first."""
+    """Return the harmonic mean of G, Pa, over the volume of soil with a strength, because soft soil flows first."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
@@ -333,7 +328,7 @@ def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _of(m: Skeleton) -> list[str]:
-    """Return the names of the constants of a material that the factor divides."""
+    """Return the names of the material's constants that the factor divides."""
     if not isinstance(m, Frictional):
         return []
     own = {f.name for f in fields(m)} & set(STRENGTHS)

@@ -34,8 +34,7 @@ from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rul
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.step_memory import StepControl
+from mpm_dolfinx.stepping.state import State, StepControl
 
 PARTS = (
     "cut domains",
@@ -81,29 +80,29 @@ def run(
     t_end
         End time, s, > t (not a duration).
     dt
-        Step and output interval, s, > 0, at most t_end - t. With `rtol` it is only the output interval. With `rtol`,
+        Step and output interval, s, > 0; limited to t_end - t. With `rtol` it is only the output interval. With `rtol`,
         and neither `dt` nor `t_eval`, every step is an output.
     rtol
-        Choose the steps by their error. The estimated error of the pore pressures stays below about `rtol` times the
+        Tolerance of adaptive steps. The estimated error of the pore pressures stays below about `rtol` times the
         larger of two changes: the largest since the start of the run, and the undrained change of the step. `rtol` is
-        at least ten times `tolerance`, and < 1. Without flow of fluid the steps are the output intervals; terms with
-        the velocity then raise ValueError, because they have no error estimate. With inertia the error of the motion
-        is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil the
-        error of the water content is limited too, relative to its largest change in a step so far. The estimate is a
-        fraction of a first-order step's error, see `solve.newton.ERROR`. True errors were 0.7 to 5 times the estimate;
-        the largest ratio occurs directly after a jump of the load.
+        at least ten times `tolerance`, and < 1. If no fluid flows, the steps are the output intervals; a term or law
+        that depends on velocity then raises ValueError: its error cannot be estimated. With inertia the error of the
+        motion is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil
+        the error of the water content is limited too, relative to its largest change in a step so far. The estimate is
+        a fraction of a first-order step's error, see `solve.newton.ERROR`. True errors were 0.7 to 5 times the
+        estimate; the largest ratio occurs directly after a jump of the load.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     first_step, max_step
-        With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 20 rtol times
+        With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 18 rtol times
         the time for diffusion through a cell, and at least a thousandth of the first output interval.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
         number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
         event. Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event:
         the run ends at the first state found after it, at most a thousandth of the step later. This state is an output;
-        `Result.event` has the function's index and the time. Values must be equal on all processes. Histories that
-        ended at an event are complete, as at t_end; a run without `until` continues them.
+        `Result.event` has the function's index and the time. Values must be equal on all processes. An event completes
+        the histories, as t_end does; a later run without `until` continues them.
     probes
         Material particles with recorded results.
     observe
@@ -127,7 +126,7 @@ def run(
     ValueError
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        A step failed at any length; the exception has the histories so far. `points` and `t` are of the last good step.
+        A step failed at any length; the exception has the histories so far. `state` is that after the last good step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -188,7 +187,7 @@ def run(
 
 
 def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
-    """Raise ValueError for arguments that differ between processes, which would otherwise wait for each other."""
+    """Raise ValueError if arguments differ between processes: the processes would wait for each other."""
     texts = comm.allgather([line(value) for value in given.values()])
     for k, name in enumerate(given):
         for rank, text in enumerate(texts):
@@ -249,7 +248,7 @@ def _histories(
     control = simulation.state.control
     if after is None:
         motion = 0.0 if rule.by_error and state.stage.inertia else None
-        before = 0.0 if control is None else control.first
+        before = (0.0,) if control is None else control.first
         fresh = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), fresh
     if latest is None or control is None or after.rows.run is not latest.rows.run:
@@ -312,9 +311,9 @@ def _accepted(
     rule: StepSize, start: State, size: float, new: State, report: Report, preferred: float | None = None
 ) -> State:
     """Return the state after a step of length `size`, s, with its histories; preferred: nominal step, s."""
-    grown = measured(start.control, report, start.result)
+    grown = measured(start.control, report)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
-    grown = replace(grown, first=0.0 if new.stays else report.first / size)
+    grown = replace(grown, first=(report.first / size).tolist())
     return replace(new, result=start.result.after(report), control=grown)
 
 
@@ -349,7 +348,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
             size = whole
             how = (EULER,)
             (new, report) = found
-        now = measured(control, report, result)
+        now = measured(control, report)
         if (shrinks := rule.refused(size, report, now)) < 1:
             small = preferred = size * shrinks
             if state.t + small == state.t:
@@ -374,7 +373,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
         found = simulation.advanced(dt, EULER)
     except StepFailed:
         return None
-    what = "t = %g s: a step of %.3g s by backward Euler, of first order, because none by %s converged: %s"
+    what = "t = %g s: a step of %.3g s by backward Euler, of first order, because no step by %s converged: %s"
     values = simulation.state.t, dt, simulation.scene.numerics.method, failed
     warn(simulation.scene.grid.comm, ResolutionWarning, what, *values)
     return found
@@ -384,7 +383,7 @@ def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> 
     """Return whether points leave the grid in a step that is accurate: shorter steps cannot prevent this."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
-    return rule.refused(size, failed.report, measured(state.control, failed.report, state.result)) == 1
+    return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:

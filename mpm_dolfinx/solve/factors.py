@@ -2,16 +2,16 @@
 """Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
 
 PETSc's own factors of displacement matrices, with a block for each node, take a third of the time of scalar factors.
-With 44000 unknowns in 2D and minimum degree ordering the first factorisation takes 110 ms, the next with the same
-pattern 60 ms (scalar 430 and 150; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290). A solve takes 4 ms
-(MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two processes MUMPS takes
-as long, and 25 ms for a solve. With few processes, one process therefore holds the factors of displacements, which many
-solves use. Another holds the factors of pressures, computed at the same time. With both factorised on all of four
-processes, which share the memory's bandwidth, the factorisations took 1.7 times as long.
+Times of the first factorisation, and of the next with the same pattern, with 44000 unknowns in 2D and minimum degree
+ordering, ms: blocks 110 and 60, scalar 430 and 150, MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290. A
+solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two
+processes MUMPS factorises in the same time, and solves in 25 ms. With few processes, one process therefore holds the
+factors of displacements, which many solves use. Another holds the factors of pressures, computed at the same time.
+Factorisation of both on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
-(`dissection`) takes 3.0 s and 4.6e7 entries. PETSc's nested dissection takes 5.1 s and 5.0e7, minimum degree 6 to 12 s
-and 7.5e7 (MUMPS 6.2 s and 5.3e7). With a tenth of the unknowns the three take 80, 110, 120 ms; with fewer the same.
+(`dissection`) takes 3.0 s and 4.6e7 entries; by PETSc's nested dissection 5.1 s and 5.0e7; by minimum degree 6 to 12 s
+and 7.5e7 (MUMPS 6.2 s and 5.3e7). With a tenth of the unknowns the orders take 80, 110, 120 ms; with fewer, the same.
 
 The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use it. With OpenBLAS MUMPS takes 1/2 to
 1/3 of the time.
@@ -67,7 +67,7 @@ def direct_solver(
             ksp.pc.setFactorSolverType(package)
         else:
             ksp.pc.setFactorOrdering("nd" if gathered else "amd")
-            ksp.pc.setFactorPivot(0.0)  # no limit: PETSc's 2e-14 rejects rows of nearly empty cells
+            ksp.pc.setFactorPivot(0.0)  # no smallest pivot: PETSc's, 2e-14, rejects rows of nearly empty cells
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
@@ -83,7 +83,7 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 def renew(A: PETSc.Mat) -> None:
     """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices.
 
-    PETSc orders unknowns by equal row patterns before the sums. LU factors with this ordering are wrong.
+    PETSc has grouped rows with equal patterns before the sums. LU factors with these old groups are wrong.
     """
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 

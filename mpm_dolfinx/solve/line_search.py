@@ -5,18 +5,18 @@ Without yield the step is full, even if the residual grows, because rotations of
 at first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
 In yielding soil the step is full if the residual falls, or if the residual forces at its end do less than half of the
-initial work along it. Otherwise the search ends where their work is about zero (Matthies and Strang 1979). There the
-unloading soil is elastic, also in the next tangent. The work includes that of the fluid's residual, because
+initial work along it. Otherwise the search ends where this work is about zero (Matthies and Strang 1979). There soil
+that unloads is elastic, also in the next tangent. The work includes that of the fluid's residual, because
 the forces' work alone nearly vanishes if only the fluid is out of balance. Shorter steps with smaller residuals would
-lead to more short steps. Bracketed secants find the point. Soil that has lost its strength needs several secants: with
+lead to more short steps. Bracketed secants find the zero. Soil that has lost its strength needs several secants: with
 one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
 overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
 relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows with
-the step length for any soil. Soil that has not yielded is regularised too, because it flows as far when it first
-yields. Before the first yield there is no regularisation while the tangents converge, because wet elastic soil would
-then take 1.6 times the Newton steps.
+the step length for any soil. Soil that has not yielded is regularised too, because full steps overshoot just as far
+when this soil first yields. Before any soil yields there is no regularisation while the tangents converge: with it, wet
+elastic soil would take 1.6 times the Newton steps.
 
 A few flowing points may give the tangent a negative stiffness. Newton's direction then leads backwards: it unloads
 these points, the next step loads them again, and the iterations cycle. The work of the residuals along the direction is
@@ -33,7 +33,7 @@ import numpy as np
 EXPLODES, SHORTEST = 1e4, 1e-3
 """Growth of the residual above which a step without yield is halved, and smallest fraction of the full step.
 
-With a growth of 1e3 or 1e5 scenes take the same steps, because it is below both, or the residual is not finite.
+With 1e3 or 1e5 as the limit, scenes take the same steps: the growth is below 1e3, or the residual is not finite.
 """
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
@@ -63,7 +63,7 @@ class Search:
     """Search for a step at whose end the residuals do less than half of their initial work."""
 
     step: float = 1.0  # next trial, as a fraction of the full step
-    low: float = 0.0  # steps between which the work changes its sign, as `high`
+    low: float = 0.0  # from `low` to `high` the work changes its sign
     at_low: float = 1.0  # work at `low` / initial work
     high: float = np.inf
     at_high: float = np.nan  # work at `high` / initial work
@@ -74,8 +74,8 @@ class Search:
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next trial; work: that of the last trial / initial work, nan if not finite; None: the search ends.
 
-        growth: factor by which the residual grew. A full step that does not increase the residual may end with up to
-        the initial work. The next trial is that of a secant, or of bisection if a bound stays for a second time.
+        growth: factor by which the residual grew. A full step that does not increase the residual ends the search with
+        up to the initial work. The next trial is that of a secant, or of bisection if a bound stays a second time.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

@@ -4,8 +4,8 @@
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
 
-The solver is GMRES, preconditioned from the right with the upper block triangle. In this the fixed-stress operator P =
-C + beta V approximates the Schur complement C + B K^-1 B^T. One multigrid cycle each approximates K^-1 and P^-1.
+The solver is GMRES, preconditioned from the right with the upper block triangle, in which the fixed-stress operator P =
+C + beta V replaces the Schur complement C + B K^-1 B^T. One multigrid cycle approximates K^-1, another one P^-1.
 
 In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods were slower; they were tested
 with algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15.  Conjugate gradients on the Schur complement
@@ -14,16 +14,16 @@ to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles, and left a 
 GMRES takes 8 iterations to 1e-5, and 12 with algebraic multigrid on P.
 
 At nu = 0.499 the cycle is poor, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too many
-iterations (see `plan`), or is predicted to, factors of K replace the cycle, and are kept until a solve with them takes
-too many.  With other tangents of the step a solve takes about 10.  A step takes 6.2 s, but 8.5 s with new factors for
-each tangent (4 to 6 iterations); four steps of yielding soil, 12^3 cells, take 33 and 41 s.  MUMPS factorises 3190
-unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations (22 at nu = 0.49 with contrasts
-of 1e3).
+iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
+takes too many iterations.  With factors of an earlier tangent a solve takes about 10, with new ones 4 to 6.  A step
+then takes 6.2 s, but 8.5 s with new factors for each tangent; four steps of yielding soil, 12^3 cells, 33 and 41 s.
+MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations (22 at nu
+= 0.49 with contrasts of 1e3).
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
-wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28. Its time is 0.9 times that of a
-direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage (p -> p + k B
-u), K is as at nu = 0.3, but GMRES takes 500 iterations, because alternating pressures have almost no stiffness.
+wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long
+as a direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage (p -> p +
+k B u), K is as at nu = 0.3, but GMRES takes 500 iterations: alternating pressures have almost no stiffness.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from mpm_dolfinx.solve.solver_choice import SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. With scales that differed by 5e5, rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. With scales of both residuals 5e5 apart, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()
@@ -101,7 +101,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return fluid volume displaced by the residual forces / norm of these forces, in each part (parts,), m^d/N."""
+        """Return (fluid volume that the residual forces displace) / (norm of these forces), m^d/N, by part (parts,)."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -231,7 +231,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if the rate of the last many / 4 iterations predicts more than `many`."""
+    """Return a monitor that ends a solve if its rate in the last many / 4 iterations predicts a count above `many`."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

@@ -36,7 +36,7 @@ FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
 """Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
 
 Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. Without a direct solver GMRES takes 126
-iterations, 112 with GAMG; with a single sweep of smoothing it fails. With a direct solver both smoothers are as fast.
+iterations, 112 with GAMG; with one sweep of smoothing it fails. With a direct solver both smoothers are equally fast.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -63,8 +63,8 @@ def multigrid_solver(
     name
         Prefix of the solver's PETSc options.
     places : (n, d + 1)
-        Unknowns of this process: indices along the grid axes and component, all >= 0. Components are interpolated
-        alone.
+        Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
+        interpolated by itself.
     held : (m, d + 1)
         Fixed degrees of freedom in cells of bodies; interpolated displacements vanish there.
     nodal
@@ -123,9 +123,9 @@ def interpolation(
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
     """Return the interpolation, this process's coarse unknowns, and fixed coarse degrees of freedom.
 
-    A coarse cell is kept if a fine cell in it is an unknown. A coarse node is kept if it interpolates to a free fine
-    node; if it also interpolates to a fixed node, it must coincide with a free one. The columns of
-    the interpolation matrix are then linearly independent.
+    A coarse cell is kept if a fine cell in it is an unknown. A coarse node is kept in two cases: it interpolates to
+    free fine nodes only, or it coincides with a free fine node. The columns of the interpolation matrix are then
+    linearly independent.
     """
     rows, coarse, weights = _hats(places, nodal, lines)
     near_fixed = _hats(held, nodal, lines)[1]
@@ -183,16 +183,12 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the numbers (n,) of coarse unknowns, NONE for other candidates, and whether this process owns them (n,).
+    """Return the indices (n,) of coarse unknowns, NONE for other candidates, and whether this process owns them (n,).
 
     The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
-    Parameters
-    ----------
-    keys : (n,)
-        Coarse candidates of this process, ascending, below `count`.
-    stated : (n,)
-        Status of each candidate on this process: MAYBE, NOT or IS; the largest value of all processes counts.
+    keys (n,): coarse candidates of this process, ascending, below `count`; stated (n,): status of each candidate on
+    this process, MAYBE, NOT or IS, of which the largest value of all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

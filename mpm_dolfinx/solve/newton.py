@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Unconnected parts of the bodies balance independently. Each part has its own forces, fluid and lengths of Newton steps.
-The state and the stiffness of other parts do not affect it.
+Unconnected parts of the bodies balance independently. Each part has its own forces, fluid and lengths of Newton steps,
+which do not depend on the state and the stiffness of other parts.
 
 A Newton step of the two problems reads
 
@@ -14,7 +14,7 @@ fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: b
 alternate from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full,
 slightly unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve
 with C + beta V at constant stress, and a momentum solve, alternate. Large bodies use multigrid, because a direct solver
-is too expensive. `schur-...` then solve for both unknowns together, see `monolithic`.
+is too expensive. `schur-cg` and `schur-fgmres` then solve for both unknowns together, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ SOLVED = 0.05
 """Residual after the last linear solve, divided by the tolerance.  Halving this value changes the result of scene
 "soil" in tests/plateaus.py by 4.0e-12 (relative), doubling it by 3.1e-11, and finer cells by 3.0e-02.
 """
-SETTLED = 1e-2  # residual below which slip of contacts may end, as above it the contact area still changes
+SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
 ERROR = 1 / 20
 """Assumed pressure error of a run, divided by the first-order estimate e.
 
@@ -156,6 +156,7 @@ def note_pressures(
     seconds: float,
     dt: float,
     rates: Sequence[Rates],
+    of_bodies: Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]],
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
@@ -169,6 +170,8 @@ def note_pressures(
         Weight of the first rates in the step, s.
     dt
         Length of the step, s.
+    of_bodies
+        Function of active owned cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -180,15 +183,15 @@ def note_pressures(
     if len(rates) > 1:
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
         sealed = storage.sealed(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
-    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second, sealed)]
+    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, sealed)]
     filling = storage.filling(error) if forms.retains else (error[:0], error[:0])
     largest += [values.max(initial=0.0) for values in filling]
-    largest += [values.max(initial=-np.inf) for values in (-p, p)]
-    largest = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
-    report.error, report.change, report.first, second, report.sealed, *fills, low, high = largest
+    report.error, report.sealed, *fills = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
     report.fills = tuple(fills)
-    report.extremes = (-low, high)
-    report.sudden = report.first if len(rates) > 1 and second < SUDDEN * report.first else 0.0
+    changes = storage.fill * np.abs([p - start, first, second])
+    report.change, report.first, second, *ends = of_bodies(owned, np.concatenate([changes, [-start, start, -p, p]]))
+    report.extremes = np.reshape(ends, (2, 2, -1)) * [[-1.0], [1.0]]
+    report.sudden = np.where(len(rates) > 1 and second < SUDDEN * report.first, report.first, 0.0)
 
 
 class Newton:
@@ -211,7 +214,7 @@ class Newton:
         self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
-        """Solve both balances by Newton's method; the tangent is kept while it converges, for linear laws over steps.
+        """Solve both balances by Newton's method; a tangent is kept while it converges, by linear laws over many steps.
 
         serves: whether the tangent of the previous substep may be reused.
         """
@@ -273,8 +276,8 @@ class Newton:
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors at the starting point: a guess that is better than the present (u, p), if any.
 
-        A better guess has less potential energy in elastic bodies, else a smaller residual.  Bending needs small
-        forces, so a good guess of it may have a larger residual than no guess.  Also return the other start, or None.
+        A better guess has less potential energy in elastic bodies, else a smaller residual.  (Bending needs small
+        forces: its best guess may have a larger residual than the present u.)  Also return the other start, or None.
         """
         errors, start = self._errors(), self._iterate()
         guesses = [] if self._linear or errors.worst <= self._scheme.tolerance else self._momentum.guesses()
@@ -299,9 +302,9 @@ class Newton:
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
     def _potential(self) -> Callable[[Errors], NDArray[np.float64]]:
-        """Return a function for twice the present potential energy (parts,), J, less that at the present u.
+        """Return a function: twice the potential energy (parts,), J, at the u of its call, minus that at the present u.
 
-        The difference is the work of the residuals, by the trapezoidal rule. The errors must be those of the present u.
+        The difference is the work of the residuals, by the trapezoidal rule. Residuals must be assembled at both u.
         """
         system = self._momentum.system
         r, u = system.residual.array_r.copy(), system.step.array_r.copy()
@@ -326,8 +329,8 @@ class Newton:
         """Raise NotConverged at an unstable equilibrium, because smaller steps find the path that leaves it.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
-        delays buckling. If a step has kept its first tangent, the check follows in the next step. An equilibrium within
-        tolerance may seem unstable where only soft springs resist a motion, so it is corrected once.
+        delays buckling. A tangent that is kept for the whole step shows an instability only in the next step. Where
+        only soft springs resist a motion, an equilibrium within tolerance may seem unstable, so it is corrected once.
         """
         if not negative_pivots(self._solvers.solve_u):
             return
@@ -387,7 +390,7 @@ class Newton:
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Round-off counts as 0. The stored residual includes round-off, with a scale of at least round-off / tolerance.
+        Residuals within round-off are returned as 0, but stored as they are, with scales >= round-off / tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):

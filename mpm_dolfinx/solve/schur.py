@@ -215,9 +215,10 @@ class LinearSolvers:
                     P = storage.assemble_preconditioner(self.scheme.beta, share)
                     self._solve_s.setOperators(self._schur, P)
                 factorise(self.solve_u.pc, self._solve_s.pc)
-                # a resumed run lacks factors of earlier steps: they must not be reused
+                # reused within a step only, because a resumed run lacks factors of earlier steps
                 kept.operator = not self.scheme.richardson and data is None
-        self._tell_unread()
+        if first:
+            self._tell_unread()
         return True
 
     def _tell_unread(self) -> None:
@@ -225,10 +226,9 @@ class LinearSolvers:
         if not self.scheme.petsc_options:
             return
         comm = self.du.comm.tompi4py()
-        names = sorted(set.intersection(*map(set, comm.allgather(self._unread))))
+        names = sorted(set.intersection(*comm.allgather(self._unread)))
         if names:
             warn(comm, ConditionWarning, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
-        self._unread.clear()
 
     def solve(
         self,
@@ -304,7 +304,7 @@ class LinearSolvers:
         x.array_w[:] *= scale
 
     def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
-        """Limit the decrease of pressures in the direction as the retention curves require; update displacements."""
+        """Limit the pressure decreases of the direction, see `restrained`, and update the direction's displacements."""
         if not storage.forms.retains:
             return log_change
         dp, log_change = storage.restrained(self.dp.array_r, log_change)

@@ -31,14 +31,14 @@ class Thresholds:
         and a solve take, with 196000 unknowns: PETSc 2.6 and 0.02 s, MUMPS with OpenBLAS 0.7 and 0.09 s; with 51000
         unknowns: PETSc 0.25 and 0.004 s, MUMPS 0.12 and 0.02 s. A Newton step takes five to ten solves.
     gathering
-        Largest number of processes for which a single one holds the factors of many solves. With both factorised
-        on all of four processes, which share the memory's bandwidth, the factorisations took 1.7 times as long.
+        Largest number of processes for which a single one holds the factors of many solves. Factorisations on all of
+        four processes took 1.7 times as long, because these share the memory's bandwidth.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
         Iterations of a solve above which a direct solver replaces multigrid, or the next tangent renews the factors of
-        the fixed-stress operator.  For this renewal, 12, 25, 50 and 500 give equal Newton steps (footing, 9 cells).
+        the fixed-stress operator.  Renewal after 12, 25, 50 or 500 gives equally many Newton steps (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
@@ -89,10 +89,8 @@ class SolverPlan:
         Whether one process holds the factors.
     symmetric
         Whether K is symmetric.
-    many
-        Iterations of a solve above which new factors are computed: see `Thresholds`.
-    coarsest
-        Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
+    many, coarsest
+        See `Thresholds`.
     forcing
         Tightest relative tolerance of a linear solve; see `plan`.
     keep

@@ -48,7 +48,7 @@ class Start(NamedTuple):
     renewed: int = 0  # number of renewed particle domains
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep; earlier: their data from the previous substep."""
+        """Return the loads at the beginning of a substep; earlier: data of the loads from the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)

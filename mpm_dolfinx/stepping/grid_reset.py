@@ -176,7 +176,8 @@ class OnGrid(Keyed):
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
 
-        The mass potentials pi (m,), Pa, preserve linear fields; a constant for each point corrects their pressures.
+        The mass potentials pi (m,), Pa, preserve linear fields. A constant for each point, added to the pressures of
+        its pieces, then preserves the water.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -250,16 +251,16 @@ class OnGrid(Keyed):
         store: NDArray[np.float64],
         stage: Stage,
         t: float,
-        water: PoreWater | None = None,
-        at_rest: AtPlaces | None = None,
+        water: PoreWater | None,
+        at_rest: AtPlaces | None,
     ) -> list[NDArray[np.float64]]:
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
-        The mean of the pieces' mass potentials in a cell is that of the cell. The weight is `store` (m,), m^d/Pa, the
-        storage of the pieces; in cells without storage the volume. t: time, s, of the pressures on drained sides.
+        The mean of the pieces' mass potentials in a cell is the cell's potential. Its weight is `store` (m,), m^d/Pa,
+        the pieces' storage; in cells without storage their volume. t: time, s, of the pressures on drained sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
-        hydrostatic pressures `at_rest`, if fluid can flow.
+        hydrostatic pressures `at_rest`.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -305,12 +306,12 @@ class OnGrid(Keyed):
     def pressures_up_to_surface(
         self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their volume mean in a cell is that of the cell.
+        """Return the pressures (m,), Pa, at the pieces' centroids; their volume mean in a cell is the cell's pressure.
 
         The reconstruction acts on differences from hydrostatic pressures, which cause no flow through sealed sides. In
         axisymmetry centroids and mean refer to the sections.
 
-        t: time, s, of the pressures on drained sides; at_rest: function for hydrostatic pressures, None without flow.
+        t: time, s, of the pressures on drained sides; at_rest: hydrostatic pressures, None without gravity.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -560,7 +561,7 @@ class Assembled(Keyed):
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return the rounding error of the residual at the active local nodes (nodes,), N.
 
-        The error is proportional to the stiffness of the cells at a node, and to the stiffness of the loads.
+        Two terms are added: one proportional to the stiffness of the cells at a node, one to that of penalties there.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
@@ -574,7 +575,7 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u; begins: of a step.
+        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u; begins: see `mobility`.
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 

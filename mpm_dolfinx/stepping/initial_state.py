@@ -2,7 +2,7 @@
 """State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
 
 Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
-pressures remove these forces. Their deformation adds to the elastic strain of the points. Positions do not change.
+pressures remove these forces. The steps add to the elastic strain of the points, and do not change their positions.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Loads, Place
 from mpm_dolfinx.conditions.conditions import Quiet
-from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
 from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.domains.fitted import fitted_at
@@ -41,7 +40,7 @@ from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.exchange import everywhere, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
@@ -53,13 +52,13 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""DEPTH iterations are mixed; the last is that after PATIENCE iterations without reduction of the residual by LESS.
+"""DEPTH iterations are mixed, until PATIENCE successive residuals are not below LESS times the best one so far.
 
-Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16 or 80
-and 24 the remaining relative forces are 4e-5 to 3e-9, after as many iterations; with 40 and 8 they are up to 6e-3.
+Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16, or 80
+and 24, iterations are equally many, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3 remain.
 """
 REMARKABLE = 0.05
-"""Change of stress by balancing, divided by the largest given stress, above which a warning is given.
+"""Change of stress by balancing, divided by the largest given stress, above which there is a warning.
 
 It is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
@@ -141,7 +140,7 @@ def begin_stage(
     if scene.initial.given:
         gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
-        what = f"stage: add: body {add[0]}: domains of others have been renewed"
+        what = f"stage: add: body {add[0]}: domains of other bodies have been renewed"
         raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
@@ -169,7 +168,7 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return a state before the next step, and by data name the points (m,) and tractions (m, d), Pa, on quiet sides.
+    """Return the state reset for a step, and by data name the points (m,) and tractions (m, d), Pa, on quiet sides.
 
     The tractions balance stresses, loads of the previous stage, and remaining supports. after: the new stage.
     """
@@ -230,7 +229,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError for quiet sides in a stage with another weight, which their tractions do not bear."""
+    """Raise ValueError if a stage with quiet sides changes the weight: the sides' tractions would not bear it."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -275,7 +274,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points with added bodies, and the points of these bodies alone; a body is placed after its base."""
+    """Return all points with added bodies, and the points of these alone; each is placed after the bodies below it."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -297,7 +296,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data from earlier stages, which added bodies do not have."""
+    """Return the points without data that added bodies lack; ValueError if `fields` does not give such data anew."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -322,7 +321,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
     points = replace(points, data=data)
-    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))
+    return everywhere(scene.grid.comm, lambda: scene.materials.changed("stage: fields", points, fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
@@ -414,7 +413,7 @@ def balanced(scene: Scene, state: State) -> State:
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
     """Log the changes by balancing; raise ValueError for a large relative residual.
 
-    With contact (touches), which is detected only in the first step, a large residual causes a warning.
+    With contact (touches), which is detected only in the first step, a large residual causes a warning only.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:

@@ -74,7 +74,7 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
 
 
 def _of_all(grid: Grid, state: State) -> NDArray[np.float64]:
-    """Return the true positions (n, d), m, of the points of all processes, ordered by number."""
+    """Return the true positions (n, d), m, of the points of all processes, ordered by id."""
     found = grid.comm.allgather((state.points.id, state.points.x))
     ids, x = (np.concatenate(values) for values in zip(*found, strict=True))
     return x[np.argsort(ids)] + grid.base

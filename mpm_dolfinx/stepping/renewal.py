@@ -2,17 +2,18 @@
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
 F of yielded soil is updated by increments, so domains serve for integration only. They may be replaced if the new
-domains fill the same region, with the same surface and contents. Cells of a domain longer than a cell are filled anew:
+domains fill the same region, with the same surface and contents. Cells with a piece of a domain longer than `LONGEST`
+are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
   there becomes `EDGES` edges, with the same ends, area and sharp corners.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
-each cell. Mass-weighted sums of other point data are exact too, such as of the logarithm of the elastic left
-Cauchy-Green tensor. These data are means over the overlap of old and new domains, shifted to the new centroids by
-fitted slopes, within the range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or
-several surface crossings are unchanged.
+each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
+These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
+range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings
+are unchanged.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.cutting import FACES, centroids, volumes
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space
+from mpm_dolfinx.points.cutting import centroids, volumes
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain in cells; a longer one should bend, but has straight edges. Source: definition."""
+"""Largest length of a domain, in cell sizes; longer ones should bend, but have straight edges. Source: definition."""
 
 
 class Renewal:
@@ -161,7 +162,8 @@ class Renewal:
     ) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, of new domains, so that their cells contain the fluid of the old domains.
 
-        group (m,): group of each new domain, see `RefilledCells`; it has one pressure, the mean by storage or volume.
+        group (m,): group of each new domain, see `RefilledCells`.  All domains of a group have one pressure: the mean
+        weighted by storage, or by volume if there is no storage.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
@@ -185,7 +187,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of all outer faces, and a number for the conditions on each; -1 if they forbid renewal."""
+        """Return the keys of outer faces, and an index of the set of conditions on each, -1 if it forbids renewal."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -238,7 +240,7 @@ class Renewal:
         volume0 = V[group] * size / A[group] / ratio
 
         def kept(values: NDArray) -> NDArray:
-            """Return means whose sum by mass is exact: the defect is distributed within the range of the values."""
+            """Return means with an exact mass-weighted sum; its defect is distributed within the values' range."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
@@ -259,9 +261,9 @@ class Renewal:
         F = ratio[:, None, None] ** (1 / d) * np.eye(d)
         data = {}
         logs = np.zeros((len(points), 3, 3))
-        logs[work.affected] = _log(self._elastic(points, np.flatnonzero(work.affected)))
+        logs[work.affected] = _of_tensors(np.log, self._elastic(points, np.flatnonzero(work.affected)))
         across = np.exp(mean(np.log(points.data[ACROSS]))) if ACROSS in points.data else None
-        data["plastic"] = _pulled(F, across, _exp(kept(logs)))
+        data["plastic"] = _pulled(F, across, _of_tensors(np.exp, kept(logs)))
         for name, values in points.data.items():
             if name in touched:
                 data[name] = work.on_faces(values, corners, parent, group, points)
@@ -287,9 +289,7 @@ class Renewal:
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points with indices `rows`."""
-        F = np.tile(np.eye(3), (len(rows), 1, 1))
-        seen = points.F_of_laws[rows]
-        F[:, : seen.shape[1], : seen.shape[1]] = seen
+        F = unstretched(points.F_of_laws[rows])
         return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
 
 
@@ -298,20 +298,13 @@ def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 
-def _log(b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a function, such as np.log, of symmetric tensors b (n, 3, 3)."""
     value, axes = np.linalg.eigh(b)
-    return (axes * np.log(value)[:, None]) @ axes.swapaxes(1, 2)
-
-
-def _exp(e: NDArray[np.float64]) -> NDArray[np.float64]:
-    value, axes = np.linalg.eigh(e)
-    return (axes * np.exp(value)[:, None]) @ axes.swapaxes(1, 2)
+    return (axes * function(value)[:, None]) @ axes.swapaxes(1, 2)
 
 
 def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return C_p^-1 (n, 3, 3) for elastic left Cauchy-Green tensors b (n, 3, 3) and F."""
-    whole = np.tile(np.eye(3), (len(F), 1, 1))
-    seen = F if across is None else in_space(F, across)
-    whole[:, : seen.shape[1], : seen.shape[1]] = seen
-    inverse = np.linalg.inv(whole)
+    inverse = np.linalg.inv(unstretched(F if across is None else in_space(F, across)))
     return inverse @ b @ inverse.swapaxes(1, 2)

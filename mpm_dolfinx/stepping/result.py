@@ -44,7 +44,7 @@ class Result:
     converged
         Whether the run has reached its end.
     event
-        Index in `until`, from 0, of the function that ended the run, and its time, s; None without an event.
+        Index in `until`, from 0, of the function that ended the run, and time of the event, s; None without an event.
     points, memory, imbalance
         Values at the end of the run: number of material points; peak memory of all processes with libraries, MB;
         (largest load of a process) / (mean load).

@@ -124,9 +124,9 @@ class Scene:
         self.motion = Motion(scene, bodies, self.momentum, self.storage, self.numerics.keep_volumes)
         # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
-        self._on_grid: Latest[OnGrid] = Latest()
-        self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
+        self._on_grid: Latest[OnGrid] = Latest(self._assembled)
+        self._systems: Latest[System] = Latest()
         self._renewed: Latest[tuple[dict[str, Any], int]] = Latest()
         _ = self._renewal  # raises ValueError for scenes that do not support renewal
 
@@ -183,15 +183,15 @@ class Scene:
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
-            what = "gravity = %.6g m/s^2, but conductivities become mobilities by the fluid's density x 9.81 m/s^2, as "
-            what += "gravity changes with time: must be given as Fluid(gravity=...)"
+            what = "gravity = %.6g m/s^2, but as gravity changes with time, conductivities become mobilities by the "
+            what += "fluid's density x 9.81 m/s^2; their gravity must be given as Fluid(gravity=...)"
             warn(self.grid.comm, ConditionWarning, what, strength)
             self._warned.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        It is the weight in `stage` at the start t, s, of a step; with varying gravity each step resets the grid.
+        The weight is that in `stage` at the start t, s, of a step; with varying gravity each step resets the grid.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
@@ -207,7 +207,6 @@ class Scene:
         grid = self.grid
 
         def make() -> OnGrid:
-            self._assembled.clear()  # the coefficients of the forms change now
             with _compat.Timer("cut domains"):
                 more = self.momentum.inertia is not None, self.storage is not None
                 cut = CutDomains(grid, points, self.numerics.quadrature == "domain", *more)
@@ -296,7 +295,7 @@ class Scene:
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
     def ids(self, chosen: Sequence[bool]) -> NDArray[np.int64]:
-        """Return the numbers of all points of the chosen bodies."""
+        """Return the ids of all points of the chosen bodies."""
         return np.flatnonzero(np.repeat(chosen, [len(body) for body in self.bodies]))
 
     @cached_property
@@ -334,5 +333,5 @@ class Scene:
 
     def forget(self) -> None:
         """Delete all data of a step, which may have been interrupted anywhere."""
-        for made in (self._assembled, self._systems, self._on_grid):
+        for made in (self._systems, self._on_grid):
             made.clear()

@@ -15,7 +15,6 @@ from mpm_dolfinx.base.validation import all_of, check_names, given, line, number
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES, Acting, Loads, Outcome, Place, Setting
-from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
     Drained,
@@ -32,6 +31,7 @@ from mpm_dolfinx.conditions.conditions import (
 from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
+from mpm_dolfinx.conditions.walls import fixed_nodes, with_axis
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import Contacts
 from mpm_dolfinx.contact.ties import Ties
@@ -41,7 +41,7 @@ from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides
 from mpm_dolfinx.flow.drained_sides import DrainedSides
 from mpm_dolfinx.flow.feeding import Feeding
-from mpm_dolfinx.grid.grid import SIDES, Grid
+from mpm_dolfinx.grid.grid import SIDES
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
@@ -135,7 +135,7 @@ class Stage:
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return the names of conditions that are unchanged from the previous stage, or have their own name."""
+        """Return the names of conditions that the previous stage has too: unchanged, or with a name of the user."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
@@ -231,7 +231,7 @@ def stage(
     if not any(present):
         raise ValueError("bodies: none is present, must be at least one")
     walls = with_axis(grid, conditions["walls"])
-    free = ~_held(grid, walls)
+    free = ~fixed_nodes(grid, walls)
     sides = Sides(grid, bodies, present)
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
@@ -276,18 +276,4 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
     out = numbers(name, value, (dim,), allowed=f"{dim} finite numbers")
     if axisymmetric and out[0]:
         raise ValueError(f"{name} = {line(value)}, must be (0, g): axisymmetric bodies have weight along the axis only")
-    return out
-
-
-def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
-    """Return which displacement components (nodes, d) are fixed by walls."""
-    d = grid.dim
-    out = np.zeros((len(grid.node_x), d), dtype=bool)
-    if not isinstance(walls, Mapping):
-        raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
-    for wall, axes in walls.items():
-        if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
-            raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
-        for a in axes:
-            out[grid.wall_nodes(wall), "xyz".index(a)] = True
     return out

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,6 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints, PlacedPoints
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
-from mpm_dolfinx.stepping.step_memory import StepControl
 
 
 def _freeze(kept: Mapping[str, Any]) -> None:
@@ -29,6 +28,41 @@ def _freeze(kept: Mapping[str, Any]) -> None:
             values.flags.writeable = False
         elif isinstance(values, dict):
             _freeze(values)
+
+
+@dataclass(frozen=True)
+class StepControl:
+    """Data of a run's step sizes that one step passes to the next, see `simulation/step_size.py`.
+
+    Parameters
+    ----------
+    interval : s
+        Output interval of the run, 0 without an interval.
+    small : s
+        Next trial step.
+    waits, kept
+        See `StepSize.grown`.
+    change : (bodies,), Pa
+        Largest pressure change of each body since the start of the run.
+    first : (bodies,), Pa/s
+        Value `first` of the last step in `Report`, divided by the length of the step.
+    start : (2, bodies), Pa
+        Smallest and largest cell pressures of each body at the start of the run; None before the first step.
+    motion : J^(1/2)
+        Largest motion since the start of the run, see `motion_error`; None if unused.
+    filled
+        Largest change of the water content in a step since the start of the run.
+    """
+
+    interval: float = 0.0
+    small: float = 0.0
+    waits: int = 0
+    kept: int = 1
+    change: Sequence[float] = (0.0,)
+    first: Sequence[float] = (0.0,)
+    start: Sequence[Sequence[float]] | None = None
+    motion: float | None = None
+    filled: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +115,7 @@ class Trend:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
-    """All data of a scene that one step passes to the next; immutable, as a step returns a new state.
+    """All data of a scene that one step passes to the next; immutable: each step returns a new state.
 
     A checkpoint stores all of these data except two: the stage, which the script defines, and the watched points.
 
@@ -121,7 +155,7 @@ class State:
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.
     watched : (m,)
-        Numbers of points with probes in their domains, which renewal does not replace.
+        Ids of the points whose domains contain probes; renewal does not replace these domains.
     result, control
         Histories of the last run, and its step control; None before the first run.
     """
@@ -155,7 +189,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions at which the next step cuts them; at the last reset if they keep their pieces."""
+        """Points at the positions at which the next step cuts them; with kept pieces, at those of the last reset."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)

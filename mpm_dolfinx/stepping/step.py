@@ -51,22 +51,22 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
     state, earlier = start.state, None
-    on_grid, solvers = start.on_grid, start.matrices.solvers
+    on_grid = start.on_grid
     flights, found = [flight_of(start)], []
     for placed in start.acting:
         acting = start.begun(placed, earlier)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         problem = both.momentum, both.storage, partial(on_grid.as_reset, state)
-        rates.append(solve_substep(solvers, *problem, key, report, kept))
+        rates.append(solve_substep(start.matrices.solvers, *problem, key, report, kept))
         passed.append(both.passing())
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
         earlier = [one.flown(both.momentum.at) for one in acting.loads]
-    note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
+    bodies = partial(scene.motion.of_bodies, on_grid)
+    note_pressures(report, start.matrices.solvers, both.storage, acting.substep.before * dt, dt, rates, bodies)
     report.moves = start.moves(flights[1:], acting.substep)
-    del solvers
     start.matrices.end_step()
     seconds = dt * np.array([acting.substep.before, acting.substep.own])
     at, outcome = both.momentum.at, both.outcome(state, passed, seconds)

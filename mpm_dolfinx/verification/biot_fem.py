@@ -12,10 +12,10 @@ with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(r
 `fluid_content` defines the content zeta and the mass potential pi.  Unsaturated soil has kappa k_r in place of kappa.
 Its content changes by S(p) times the change in saturated soil, plus the change of S, see `retention`.  Saturated pores
 have chi = S = k_r = 1.  If pressures are constant in the cells, the two-point flux is kappa J |F^-T N|^2 (p+ - p-)/h,
-with the distance h of the cells' centres.  This flux is not consistent under shear.  k_r is then its mean between
-the pressures of the two cells.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
-full circumference.  Materials, retention, user-defined terms and time integration are the code of the material point
-method.  The two methods differ only in discretisation.
+with the distance h of the cells' centres, and with the mean of k_r between the pressures of both cells.  This flux is
+not consistent under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the full
+circumference.  Materials, retention, user-defined terms and time integration are the code of the material point method.
+The two methods differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
-from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Source, Traction, sorted_terms
+from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.grid.grid import TURN, Grid, side
@@ -110,8 +110,8 @@ class BiotFEM:
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
-        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides; pressures on whole facets in a region.  Others are
-        free and sealed.
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts on facets that
+        lie wholly in its region.  Other sides are free and sealed.
     pressure : Pa
         Initial pore pressure, or a function of positions x (m, d), m.  The initial effective stress is zero: loads or
         strains must balance the pressure.
@@ -616,7 +616,7 @@ class BiotFEM:
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
-        """Return the volume of the pore fluid at zero pressure, m^d, of all processes."""
+        """Return the present volume of the pore fluid, m^d, of all processes."""
         u, p = ufl.split(self._space.w)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
         held = _compat.compiled(self._around * self._held(ufl.det(self._deformation(u)), p) * dx)

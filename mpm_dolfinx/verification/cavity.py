@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Expansion of cylindrical cavities in soil at finite strain, in one dimension: a reference for laws and scenes.
 
-The initial radius of the cavity is 1, with equal pressures at the cavity wall and at the outer radius.
+The initial radius of the cavity is 1. Initially the pressures at its wall and at the outer radius are equal.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ class _Rings:
         self._values, self.start = _tiled(values, count), _tiled(start, count)
 
     def _data(self, stretches: NDArray[np.float64], state: State, repeat: int = 1):
-        F = np.tile(np.eye(3), (len(stretches), 1, 1))
-        F[:, 0, 0], F[:, 1, 1] = stretches.T
+        F = np.insert(stretches, 2, 1.0, axis=1)[:, None] * np.eye(3)
         cells = np.arange(len(F), dtype=np.int32) % 8
         inputs = {name: np.concatenate([v] * repeat) for name, v in (self._values | state).items()}
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
@@ -127,10 +126,10 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return the total radial stress at the outer radius minus that at the wall, and the effective one at the wall, Pa.
+    """Return (total radial stress at the outer radius - at the wall), and effective radial stress at the wall, Pa.
 
-    The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii:
-    successive radii a of the cavity, in small steps.
+    The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii: successive radii a of the
+    cavity, in small steps.
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)

@@ -3,8 +3,8 @@
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
 T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a closed inverse of the
-Laplace transform is used, with tanh X, coth X -> 1 for X = sqrt(s).  Errors of both are of the order of
-erfc(1/sqrt(T)) < 2e-23 or less, so both are exact to round-off.
+Laplace transform is used, in which 1 replaces tanh X and coth X, X = sqrt(s).  Errors of both forms are of the order
+of erfc(1/sqrt(T)) < 2e-23 or less, so both are exact to round-off.
 """
 
 from __future__ import annotations
@@ -170,8 +170,8 @@ class Mandel:
         """Return the displacement relative to the state without force.
 
         x, y (...): positions, m, in [0, a] and [0, b]; each broadcasts with times t (...), s, > 0.
-        Returns (u_x, u_y), m; u_x is independent of y, u_y of x. Source: computed from the pressure, zero lateral total
-        stress and the resultant on the plate; equal to the displacement in the class's papers.
+        Returns (u_x, u_y), m; u_x is independent of y, u_y of x. Source: computed from the pressure and the force on
+        the plate, with zero total stress at the lateral side. It equals the displacement in papers cited for the class.
         """
         x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
         plane = self.bulk + self.shear / 3  # lambda + G

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from mpm_dolfinx.grid.grid import SIDES
 from scenes.description import AXES, Draw, Scene
 
-FAR_BODIES = ("resting", "moving", "stiff", "draining")
+FAR_BODIES = ("resting", "moving", "stiff", "draining", "yielding", "incompressible", "tight")
+"""Kinds of far bodies; those of other laws show decisions that are made for the whole scene."""
 
 
 @dataclass(frozen=True)

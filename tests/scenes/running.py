@@ -133,17 +133,26 @@ class _Builder:
         return mpm.box(self.grid, *self.frame.box(lower, upper, scene), per_cell=2, **law)
 
     def far_law(self):
-        stiff = 1e6 if self.frame.far == "stiff" else 1.0
-        constants = {"bulk": 3e6 * stiff, "shear": 2e6 * stiff, "porosity": 0.4, "grain_density": 2600.0}
-        return self.material("Hencky", constants | {"conductivity": 1e-6})
+        kind, law = self.frame.far, "Hencky"
+        constants = {"bulk": 3e6, "shear": 2e6, "porosity": 0.4, "grain_density": 2600.0, "conductivity": 1e-6}
+        if kind == "stiff":
+            constants |= {"bulk": 3e12, "shear": 2e12}
+        elif kind == "yielding":
+            law, constants = "DruckerPrager", constants | {"cohesion": 1e5, "friction": 20.0, "dilation": 0.0}
+        elif kind == "incompressible":
+            constants["bulk"] = 2e8
+        elif kind == "tight":
+            constants["conductivity"] = 0.0
+        return self.material(law, constants)
 
     def far_conditions(self, conditions: dict[str, list]) -> None:
         scene, frame = self.scene, self.frame
         region = frame.box(self.far_box[0] - 0.1 * np.array(scene.h), self.far_box[1] + 0.1 * np.array(scene.h), scene)
         region = tuple(map(tuple, region))
-        if frame.far == "moving":
+        loads = {"moving": 2e5, "yielding": 5e4, "incompressible": 2e5, "tight": 2e5}
+        if load := loads.get(frame.far):
             aside = np.zeros(scene.dim)
-            aside[-1], aside[0] = -2e5, 0.0 if scene.axisymmetric else 1e5
+            aside[-1], aside[0] = -load, 0.0 if scene.axisymmetric else load / 2
             push = self.traction(aside, scene.end / 3)
             self.of_far.append(mpm.Traction(frame.side("bottom"), push, region=region))
             conditions["tractions"] += self.of_far
