@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from best_mechanism import thrust
 from helpers import set_up
 from layers import compliance, errors
 
@@ -165,9 +166,15 @@ def on_a_floor(way, cells, length, delta, floor, steps):
 @pytest.mark.slow
 @pytest.mark.parametrize(("cells", "error"), [(10, 0.11), (20, 0.06)])
 def test_a_wall_that_gives_way_on_a_rough_floor_nears_rankine_s_pressure(cells, error):
-    """To first order in h: the wedge's toe is in the last cell."""
+    """To first order in h: Q1 velocities over-constrain the sand that flows from the toe, see `best_mechanism`."""
     K = on_a_floor(-0.001, cells, 1.5, 0.0, {"friction": 0.8}, 5)
     assert K[-1] == pytest.approx(1 / 3, rel=error)
+
+
+def test_constraints_of_dilatant_cells_and_friction_at_the_toe_lower_the_thrust_of_the_best_mechanism():
+    assert thrust(4, 0.5, free=7) == pytest.approx(0, abs=1e-3)  # a smooth floor: Rankine's pressure
+    errors = [thrust(4, 1.0), thrust(4, 0.5), thrust(4, 0.0), thrust(4, 0.0, free=1)]
+    assert errors == sorted(errors) and errors[1] < -0.2 and errors[-1] > -0.07
 
 
 @pytest.mark.slow
