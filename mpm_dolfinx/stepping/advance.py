@@ -190,9 +190,9 @@ class Motion:
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
         """Return the trend of the points after a step of dt (s)."""
         (n, d), before = points.x.shape, state.trend
-        change, turned = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
+        change, gradient_change = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
         pressure = (points.pressure - state.points.pressure)[:, None] if self._storage is not None else change[:, :0]
-        rates = np.concatenate([change, turned, pressure], axis=1)[:, None] / dt
+        rates = np.concatenate([change, gradient_change, pressure], axis=1)[:, None] / dt
         lengths, past = ([], rates[:, :0]) if before is None else (before.lengths[:2], before.rates[:, :2])
         return Trend(np.append(dt, lengths), np.concatenate([rates, past], axis=1))
 
