@@ -7,7 +7,8 @@ first-order accurate in the step.  With eight cells and steps of a fifth of a ce
 steps, without a grid, also has an error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
 1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, expanded so fast that no water flows.  The
-   initial pressure acts on the outer boundary.  In incompressible soil the motion is exact: r^2 - a^2 = R^2 - a0^2.
+   initial pressure acts on the outer boundary.  In incompressible soil the motion is exact: a point moves from radius R
+   to r, r^2 - a^2 = R^2 - a0^2, as the cavity grows to radius a.
 2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
 3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
    degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
@@ -42,7 +43,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, with lambda and kappa converted from v and Cauchy stresses."""
+    """Return the clay of Chen and Abousleiman, with lambda and kappa for ln(specific volume) and Kirchhoff stresses."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)

@@ -8,9 +8,10 @@ degrees.  In these experiments the front moves by 1.2 a L up to a = 1.8, and by 
 The sand follows the Mohr-Coulomb law without dilation.  In simple shear its shear strength is sin phi times the normal
 stress (Davis 1968), so sin phi = tan 31 degrees.  In fast flow the friction coefficient grows by 0.93 I, with the
 inertial number I (Jop, Forterre and Pouliquen 2006).  For a grain size d = L/100 this is equivalent to a viscosity of
-0.93 d sqrt(p rho_s).  p is the pressure in the middle of a heap of half the height.  With a constant viscosity,
-run-outs are as accurate as with a local viscosity (Ionescu et al. 2015).  Without viscosity, shear localises in single
-cells and dissipates energy numerically.  The front is the point at which the depth of the sand is one grain.
+0.93 d sqrt(p rho_s).  rho_s is the density of the grains, and p the pressure in the middle of a heap of half the
+height.  With a constant viscosity, run-outs are as accurate as with a local viscosity (Ionescu et al. 2015).  Without
+viscosity, shear localises in single cells and dissipates energy numerically.  The front is the point at which the depth
+of the sand is one grain.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011),
 J. Fluid Mech. 686, 378.

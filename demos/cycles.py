@@ -9,9 +9,9 @@ A block is stretched between two fixed sides and then rotated by 360 degrees.  I
 stresses before the rotation.
 
 The undrained beam has singular edges at the clamp.  Near these edges the stress grows as r^(x - 1), with cos(pi x / 2)
-= x, x = 0.595 (Williams 1952).  The rms stress within a few cells of the edges decreases as h^x, and so does the
-residual stress.  Results are given for the whole beam, far from the clamp, near the clamp, and with springs instead of
-the clamp.
+= x, x = 0.595 (Williams 1952).  r is the distance from an edge.  The rms stress within a few cells of the edges
+decreases as h^x with the cell size h, and so does the residual stress.  Results are given for the whole beam, far from
+the clamp, near the clamp, and with springs instead of the clamp.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def cycle(
     h, load
         Cell size, m; largest load, Pa.
     cycles, steps
-        Cycles, and steps in each, even.
+        Number of cycles; number of steps in a cycle, even.
     quadrature
         Quadrature at the material points, see `mpm.Numerics`.
     material

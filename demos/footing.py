@@ -16,9 +16,10 @@ Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with frictio
 (exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Limit loads are computed with very stiff soil, which flows
 before the geometry changes, on --cells cells over the width and on about twice as many.
 
-In the deep push the soil does not dilate.  Its undrained strength is s_u = xi c.  A footing at depth D carries (1 +
-0.27 sqrt(D/B)) times the undrained load of a footing at the surface (fit to bounds of limit analysis, Salgado et al.
-2004). The drained capacity at the surface lies between the capacity for the reduced friction of Davis (1968) and c N_c.
+In the deep push the soil does not dilate.  Its undrained strength is s_u = xi c, with the coefficient xi of the
+cohesion in the yield function.  A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing
+at the surface (fit to bounds of limit analysis, Salgado et al. 2004). The drained capacity at the surface lies between
+the capacity for the reduced friction of Davis (1968) and c N_c.
 
 The undrained limit load converges from below, with order 1.5: its error is -5.9, -2.4, -0.85 % with 5, 9, 17 cells. The
 outermost node of the footing also carries the half cell outside this node.  With an odd number of cells the effective
@@ -156,12 +157,11 @@ def push(
 ) -> Push:
     """Push the footing.
 
-    Parameters ---------- soil, cells Soil, and number of cells over the footing's width, odd.  depth Depth of the push,
-    divided by B.  rate V = v B / c_v; None for a scene without water.  box Width and height of the computed half of the
-    soil, divided by B.  rest Time of consolidation after the push, divided by B²/c_v.  steps Number of equal steps of
-    the push; by default a step moves the footing by `STEP` cells.  circular Whether the footing is a disc of diameter B
-    instead of a strip.  method Method of time integration, see `Numerics`.  graded Whether cells become larger away
-    from the footing.
+    soil, cells: soil, and number of cells over the footing's width, odd; depth: depth of the push, divided by B; rate:
+    V = v B / c_v, None for a scene without water; box: width and height of the computed half of the soil, divided by B;
+    rest: time of consolidation after the push, divided by B²/c_v; steps: number of equal steps of the push, by default
+    so many that a step moves the footing by `STEP` cells; circular: whether the footing is a disc of diameter B instead
+    of a strip; method: time integration, see `Numerics`; graded: whether cells become larger away from the footing.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
@@ -306,9 +306,9 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with the viscosity `viscosity` c t, where t = `seconds` is the duration of the push.
+    """Return the soil with a viscosity, Pa s: (`viscosity`) (cohesion) (duration `seconds` of the push).
 
-    A shear strain of 1 in this duration then increases the shear stress by `viscosity` c.
+    A shear strain of 1 in this duration then increases the shear stress by `viscosity` times the cohesion.
     """
     if viscosity == 0:
         return SOIL

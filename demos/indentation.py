@@ -9,7 +9,8 @@ held.
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
-  with E* = 4 G of the undrained gel.  For a layer of finite height, these equations hold with the computed force F.
+  at a distance x from the middle, with the half-width a of the contact, the radius R of the cylinder, and E* = 4 G of
+  the undrained gel.  For a layer of finite height, these equations hold with the computed force F per length.
 * Finally the pore pressure has dissipated, and the contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
   force equals that on a dry gel, which the demo also computes.
 """

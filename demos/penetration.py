@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  The bar starts inside the clay
-and is pushed until the clay flows all around it.  Then the resistance of the bar is that of Randolph and Houlsby (1984)
-for an adhesion alpha s_u on its surface,
+The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  F is the force per length of the
+bar, D the diameter.  The bar starts inside the clay and is pushed until the clay flows all around it.  Then the
+resistance of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
@@ -20,8 +20,7 @@ is the range of N in these parts, divided by the mean.
 
 Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
 c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
-once.  Domains ahead of the bar are initially narrower, in proportion to their later stretch, and finally as wide as the
-other domains.
+once.  Domains longer than a cell are replaced by new domains (renewal).
 
 With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
 larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
@@ -48,8 +47,6 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 LEG, STEADY = 0.25, 0.75  # diameters between seedings; fraction of this distance after which N is used
 BEARS = 0.999  # largest stress after a new seeding, as a fraction of the strength
 STEP, WET_STEP = 1 / 24, 1 / 18  # motion of the bar in a step, in cell sizes: dry and wet clay
-NOSE = 0.02  # width of the narrowest domains of saturated clay, divided by the width of the widest
-PARTS = 4  # the narrowest domains at the nose; each wider one has 1 / PARTS of its outer end's distance from the nose
 CLAY = mpm.DruckerPrager(2 * SHEAR, SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH, conductivity=1e-9)
 WATER = mpm.Fluid()
 CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
@@ -66,24 +63,10 @@ def exact(alpha: float) -> float:
     return np.pi + 2 * delta + 4 * np.cos(half) * (np.sqrt(2) + np.sin(half))
 
 
-def angles(around: int, nose: float) -> np.ndarray:
-    """Return the angles between which the domains around the bar lie; angle 0 is ahead of the bar.
-
-    around: number of domains of equal width.  nose: width of the narrowest domains, ahead of the bar, divided by this
-    width; 1: all domains have this width.
-    """
-    even = np.linspace(0, np.pi, around + 1)
-    if nose == 1:
-        return even
-    ratio = 1 - 1 / PARTS
-    near = even[PARTS] * ratio ** np.arange(round(np.log(nose) / np.log(ratio)) + 1)
-    return np.concatenate([np.linspace(0, near[-1], PARTS + 1)[:-1], near[:0:-1], even[PARTS:]])
-
-
-def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
+def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
     """Return the grid, half of the block around a bar at the height y, m, and the region of the block's top.
 
-    cells: number of cells over the diameter.  nose: see `angles`.  follow: the bar, if grid lines follow it.
+    cells: number of cells over the diameter.  follow: the bar, if grid lines follow it.
     """
     h = D / cells
     n = round(HALF * cells)
@@ -93,7 +76,7 @@ def clay(cells: int, nose: float = 1, y: float = 0.0, follow: mpm.Tool | None = 
         grid = mpm.Grid(lines=mpm.graded(even.lower, even.upper, [zone], h, RATIO), follow=follow)
     around, outward = 4 * round(np.pi * D / 2 / (FINE * h) / 4), round(np.log(2 * HALF / D) * D / 2 / (FINE * h))
     corners = [0, np.arctan2(HALF, HALF + y), np.pi - np.arctan2(HALF, HALF - y), np.pi]
-    at = np.interp(angles(around, nose), np.pi * np.array([0, 1, 3, 4]) / 4, corners)
+    at = np.interp(np.linspace(0, np.pi, around + 1), np.pi * np.array([0, 1, 3, 4]) / 4, corners)
     size = np.array([outward, len(at) - 1]) * h / 2
 
     top = ((0, size[1] - around / 4 * h / 2 - HALF - 1e-9), tuple(size))
@@ -189,15 +172,15 @@ def kept(simulation: mpm.Simulation) -> Callable:
 
 def push_wet(rate: float, cells: int, depth: float) -> Push:
     """Push a smooth bar by `depth` diameters into wet clay, at the rate V = `rate`."""
-    grid, body, top = clay(cells, NOSE)
+    grid, body, top = clay(cells)
     speed = rate * CV / D  # m/s
     start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
     bar = mpm.Tool(mpm.Ball((0, 0), D / 2), lambda t: (0, -speed * max(0, t - start)))
     load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t / start), region=top)
     water = {"fluid": WATER, "conditions": [mpm.Drained("right", lambda t: PRESSURE * min(1, t / start), region=top)]}
-    simulation = mpm.Simulation(
-        grid, [body], [CLAY], walls=WALLS, conditions=[load, bar, *water.pop("conditions", [])], **water
-    )
+    acts = [load, bar, *water.pop("conditions", [])]
+    numerics = mpm.Numerics(renewal=True)
+    simulation = mpm.Simulation(grid, [body], [CLAY], walls=WALLS, conditions=acts, numerics=numerics, **water)
     simulation.run(start, start, progress=False)
     out = Push()
 

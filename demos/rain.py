@@ -9,8 +9,9 @@ factor of safety is
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
 
 with the suction stress chi s of Bishop and a constant unit weight gamma.  At rest and in steady flow the suction s of
-exponential soil is known exactly: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), where q is the
-rain, k the conductivity, and z the height above the water table.
+exponential soil is known exactly: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), where alpha is
+Gardner's constant, gamma_w the unit weight of water, q the rain, k the conductivity, and z the height above the water
+table.
 
 Source: Lu and Godt (2008) for vertical flow; here the component of gravity normal to the slope replaces gravity.
 Errors: the largest error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.

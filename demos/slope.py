@@ -7,7 +7,7 @@ dilation.
 1. Factor of safety: the largest divisor of c and tan(phi) for which the slope is stable.  `mpm.factor_of_safety`
    reduces the strength of the slope at rest, and checks whether the overstress, a viscous stress, decays.  The best
    log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
-2. Run-out: the strength is suddenly divided by 1.6, in soil with the viscosity eta.  The slope slides until its new
+2. Run-out: the strength is suddenly divided by 1.6, in viscous soil.  The slope slides until its new
    shape is just stable.  The factor of safety of this shape differs from one by less than 0.1.
 """
 

@@ -3,7 +3,8 @@
 
 A bank of saturated soil with a vertical side stands on a rough floor under water.  Half of it is computed, 10 m high
 and 10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight
-is buoyant, gamma' = (1 - n) (rho_s - rho_w) g, and is a term in UFL.  Inertia is neglected.  On one process.
+is buoyant, gamma' = (1 - n) (rho_s - rho_w) g with the porosity n and the densities of grains and water, and is a term
+in UFL.  Inertia is neglected.  On one process.
 
 1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
    height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
@@ -15,15 +16,15 @@ is buoyant, gamma' = (1 - n) (rho_s - rho_w) g, and is a term in UFL.  Inertia i
    The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
    more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The
    final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The friction
-   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only arcsin(eta) = 24.2.  The remaining
-   cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number of cells or steps, or half the
-   viscosity, changes run-out and height by less than 2 %.
+   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only 24.2 degrees, the arcsine of its slope.
+   The remaining cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number of cells or
+   steps, or half the viscosity, changes run-out and height by less than 2 %.
 
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
 reduces it after each step.  A step that does not converge is cut, and repeated with the same strength.  The shorter
-step converges because a viscous stress 2 eta D, which is also a term in UFL, limits the velocity of the bank. eta / T
-is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation, because the vertical
-side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
+step converges because a viscous stress limits the velocity of the bank, also a term in UFL: 2 eta times the strain
+rate. eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation, because
+the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
 """
 
 from __future__ import annotations
@@ -198,7 +199,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Reduce the cohesion to its value at the end of the next step."""
+        """Set the cohesion to the value prescribed for the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Triaxial tests of soil laws at a point, compared with closed-form solutions, to check a law before its use.
 
-Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the same isotropic stress.
-P, Q and t_i are Kirchhoff stresses, p and q Cauchy stresses.  In an undrained test the volume is constant, so the test
-ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  During yield Q = M sqrt(P (P_c - P)).  In a drained test the
-stress path is q = 3 (p - p_0), and ends at q = M p.  Tests of Mohr-Coulomb sand, in compression and in extension, end
-at t_1 (1 + sin phi) - t_3 (1 - sin phi) = 2 c cos phi, with the principal stresses t_1 and t_3.
+Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the same isotropic stress
+p_0.  P, Q and t_i are Kirchhoff stresses, p and q Cauchy stresses: mean, deviatoric and principal stresses.  The size
+of the yield surface is P_c.  In an undrained test the volume is constant, so the test ends at P_cs = P_0 (R/2)^(1 -
+kappa/lambda), Q = M P_cs.  During yield Q = M sqrt(P (P_c - P)).  In a drained test the stress path is q = 3 (p - p_0),
+and ends at q = M p.  Tests of Mohr-Coulomb sand, in compression and in extension, end at t_1 (1 + sin phi) - t_3 (1 -
+sin phi) = 2 c cos phi, with the principal stresses t_1 and t_3.
 
 Errors are relative, and refer to the final states.
 
 --cost N compresses a block of N x N cells of Drucker-Prager, Mohr-Coulomb and Cam Clay soil until all of it yields.
-Steps of the three laws alternate, and the demo prints the processor time of a step relative to Drucker-Prager soil.
+The laws are timed in turn, one step each, and the demo prints the processor time of a step relative to Drucker-Prager
+soil.
 """
 
 from __future__ import annotations
@@ -69,7 +71,8 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
     """Return the processor time of a step of each law, divided by that of Drucker and Prager's law.
 
-    Steps of the laws alternate.  Sands have associated flow, because otherwise shear bands form in the block.
+    The laws are timed in turn, one step each, so that a varying load of the machine affects all alike.  Sands have
+    associated flow, because otherwise shear bands form in the block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}

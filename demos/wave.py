@@ -11,7 +11,8 @@
    compared.
 3. The same column, with incompressible water and grains and k = 0.01 m/s, takes a sudden load (after de Boer, Ehlers
    and Liu 1993).  Until a wave returns from the base, its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2
-   a) ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M).
+   a) ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M), the oedometric modulus M, and the volume fraction n_s of
+   the grains.
 
 The equations are the u-p form: water accelerates with the grains.
 """

@@ -29,6 +29,6 @@ def beside(
     if kind == "drains":
         drained.append(mpm.Drained("top", region=THERE))
     if wet:
-        options["fluid"] = mpm.Fluid()
+        options.setdefault("fluid", mpm.Fluid())
         loads += drained
     return mpm.Simulation(grid, bodies, materials, walls={"left": "xy"}, conditions=loads, **options)

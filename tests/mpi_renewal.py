@@ -19,7 +19,7 @@ def pushed(cells=8, renewal=True, wet=False):
     disc = mpm.Tool(mpm.Ball((0, 1.13), 0.3), lambda t: (0, -t), adhesion=100.0)
     load = mpm.Pressure("top", lambda t: 1e3 * min(1, 10 * t), region=([0.5, 0], [1, 1]))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    numerics = mpm.Numerics(renewal=renewal, keep_volumes=renewal)
+    numerics = mpm.Numerics(renewal=renewal)
     conditions, fluid = ([disc, load, mpm.Drained("top")], mpm.Fluid()) if wet else ([disc, load], None)
     options = {"walls": walls, "conditions": conditions, "numerics": numerics, "fluid": fluid}
     return mpm.Simulation(grid, [block], [CLAY], **options)

@@ -157,11 +157,6 @@ CASES = {
     "fluid without bounds": (lambda: mpm.Fluid(density=np.inf), "Fluid: density", "= inf"),
     "fluid of a word": (lambda: scene(fluid="water"), "fluid", "'water'"),
     # ---- the scene
-    "kept volumes without domains": (
-        lambda: scene(numerics=mpm.Numerics(quadrature="point", keep_volumes=True)),
-        "keep_volumes",
-        "'point'",
-    ),
     "unknown quadrature": (lambda: scene(numerics=mpm.Numerics(quadrature="gauss")), "quadrature", "'gauss'"),
     "unknown coupling": (lambda: scene(numerics=mpm.Numerics(coupling="monolithic")), "coupling", "'monolithic'"),
     "no tolerance": (lambda: scene(numerics=mpm.Numerics(tolerance=0.0)), "tolerance", "= 0.0"),

@@ -62,3 +62,15 @@ def test_what_is_known_of_a_large_body_as_seeded_takes_next_to_no_memory():
     finally:
         tracemalloc.stop()
     assert len(body) == 512000 and not lattice.given(np.arange(2)).any() and kept < 1e4 and peak < 25 * len(body)
+
+
+def test_the_last_digit_of_coordinates_does_not_decide_how_many_rows_a_box_has():
+    """5.5 cells with one point each: 122 or 131 points of two boxes."""
+    h = 0.3720326671282925
+    for per_cell, rows in ((1, 6), (3, 16)):
+        found = []
+        for cells in (0, 4, 10000, -30000):
+            grid = mpm.Grid([cells * h] * 2, [(7 + cells) * h] * 2, [7, 7])
+            lower = np.array([0.7 + cells, 0.0 + cells]) * h
+            found.append(len(mpm.box(grid, lower, lower + np.array([5.5, 1.0]) * h, per_cell=per_cell)))
+        assert found == [rows * per_cell] * 4, found

@@ -22,7 +22,7 @@ def collapsed(cells, weak, steps, renewal=False):
     moduli = {"bulk": 1500 * WEIGHT, "shear": 30 * WEIGHT, "friction": 0.0, "dilation": 0.0}
     clay = mpm.DruckerPrager(**moduli, cohesion=lambda X: np.full(len(X), STRONG))
     acts = [common.weight(WEIGHT), common.viscous(0.08 * WEIGHT)]
-    numerics = mpm.Numerics(renewal=renewal, keep_volumes=True)
+    numerics = mpm.Numerics(renewal=renewal)
     options = {"walls": {"left": "x", "bottom": "xy"}, "terms": acts, "numerics": numerics}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [clay], **options)
     s.run(1e9, 1e9, progress=False)

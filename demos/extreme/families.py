@@ -265,8 +265,8 @@ def few_points():
 def thin():
     """Beam half a cell, one or two cells high: error of the tip / error of Q1 elements on as many cells.
 
-    The beam that is half a cell high has at least two points over its height.  With one point it would creep, and the
-    package would warn.
+    The beam that is half a cell high has at least two points over its height.  With one point the beam would creep, and
+    the package would warn.
     """
     for height, h, cells in ((0.05, 0.1, (10, 1)), (0.1, 0.1, (10, 1)), (0.1, 0.05, (20, 2))):
         for n in (3, 4) if height < h else (2, 3):

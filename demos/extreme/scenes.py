@@ -33,7 +33,7 @@ Error = Callable[[mpm.Simulation, mpm.Result], float]
 class Scene:
     """A simulation to run until `end`, s, in equal steps.
 
-    error: function that returns the error of the simulation and its result; None: the scene has no equilibrium.
+    error: function of the simulation and its result that returns the error; None for a scene without equilibrium.
     """
 
     simulation: mpm.Simulation

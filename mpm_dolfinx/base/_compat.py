@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Wrappers of every function of dolfinx that differs between the supported releases (0.5.2, 0.9 and 0.11).
 
-No other module of the package asks for the version.  Branches marked OLD serve release 0.5.  Remove a branch when
-its last release is no longer supported.
+No other module of the package asks for the version.  Branches marked OLD serve release 0.5.  Remove a branch when no
+supported release needs it.
 """
 
 from __future__ import annotations

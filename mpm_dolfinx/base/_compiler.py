@@ -110,14 +110,11 @@ def _of_this_run(cache: Path, why: OSError) -> Path:
 
 
 def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
-    """Return a version of FFCx's compiling function `make` that leaves only complete libraries behind.
+    """Return a version of FFCx's compiling function `make` that leaves only complete libraries in `folder`.
 
-    Parameters
-    ----------
-    folder
-        Folder for new libraries.
-    messages
-        List to which errors of the compiler and of the disk are appended.
+    Errors of the compiler and of the disk are appended to `messages`.
+
+
     """
 
     def find_or_make(*objects, cache_dir, **settings):

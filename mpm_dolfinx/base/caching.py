@@ -22,10 +22,7 @@ class Latest(Generic[T]):
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
 
-    Parameters
-    ----------
-    derived
-        Caches of values that depend on this value; they are emptied together with this one.
+    derived: caches of values that depend on this value; they are emptied together with this one.
     """
 
     def __init__(self, *derived: Latest) -> None:
@@ -35,14 +32,9 @@ class Latest(Generic[T]):
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
         """Return the value for a key; compute the value again if the key differs from the last key.
 
-        Parameters
-        ----------
-        key
-            Everything on which the value depends: numbers, objects, arrays that never change, or tuples of these.
-        make
-            Function that computes the value.
-        comm
-            Processes that compute the value together.  If one process needs a new value, all compute it.
+        key: everything on which the value depends: numbers, objects, arrays that never change, or tuples of these;
+        make: function that computes the value; comm: processes that compute the value together.  If one process needs a
+        new value, all compute it.
         """
         other = self._entry is None or not same(self._entry[0], key)
         if other if comm.size == 1 else over_all(comm, other) > 0:

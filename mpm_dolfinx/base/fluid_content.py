@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Fluid content of the pores: the quantity stored in the fluid balance.
 
-Per reference volume, d zeta = alpha dJ + S J dp, with the storage coefficient S = n / K_w + (alpha - n) / K_s.  The
-porosity is n = 1 - (1 - n0) / J.  Therefore S J = a J + b is linear in J, with a = S(n = 1), and
+Per reference volume, the content zeta changes by d zeta = alpha dJ + S J dp.  alpha is Biot's coefficient, J the volume
+ratio, and p the pore pressure.  S = n / K_w + (alpha - n) / K_s is the storage coefficient, with the bulk moduli K_w of
+water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, at first n0.  Therefore S J = a J + b is linear in J,
+with a = S(n = 1), and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
 computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
-second-order accurate for any path.  In a step of any size without flow of fluid, it gives exactly zero.
+second-order accurate for any path.  In a step of any size without flow of fluid, the formula gives exactly zero.
 
-Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi with
-pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  The density between two pressures is the logarithmic mean
-(pi+ - pi-) / (p+ - p-).
+Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
+kappa = conductivity / unit weight.  The mass potential is pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
+The density between pressures p- and p+ is, in units of rho_w, the logarithmic mean (pi+ - pi-) / (p+ - p-).
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ def change_of_content(alpha, a, storage, J, dp):
     alpha
         Biot coefficient.
     a, storage
-        Storage coefficients, 1/Pa: `a` at a porosity of one, `storage` at the start of the step.
+        Storage coefficients, 1/Pa: `a` for a porosity of one (see the module), `storage` at the start of the step.
     J
         Volume ratio of the step.
     dp

@@ -10,7 +10,7 @@ ROUND_OFF = 64 * EPSILON
 SAME = EPSILON**0.5
 """Numbers with a smaller relative difference are considered equal.  The value corresponds to half of the digits.
 
-It is also the increment of one-sided differences.  After a Newton step of this relative size, only rounding errors
+SAME is also the increment of one-sided differences.  After a Newton step of this relative size, only rounding errors
 remain, because Newton's method squares the error.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
 """
 CENTRAL = EPSILON ** (1 / 3)

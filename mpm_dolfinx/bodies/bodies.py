@@ -130,9 +130,9 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return for each chosen domain (m,) how far, m, its straight edges deviate from the mapped edges of its box.
+        """Return the largest distances (m,), m, between straight edges of chosen domains and the mapped edges of boxes.
 
-        This is the largest distance of midpoints.  Edges of two domains on the same curve may differ by this distance.
+        Distances are between midpoints.  Edges of two domains on the same curve may differ by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import asked, instance, numbers, whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.grid.grid import MOST, Grid, among, corner_bits, in_chunks
@@ -150,9 +150,14 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
     width = grid.widths[axis][grid.cells_along(axis, (ends[1:] + ends[:-1]) / 2 - grid.base[axis])]
-    count = np.maximum(1, np.rint(np.diff(ends) / width * per_cell)).astype(int)
+    count = _rounded(np.diff(ends) / width * per_cell)
     parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(ends[:-1], ends[1:], count, strict=True)]
     return np.concatenate([*parts, [high]])
+
+
+def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return whole numbers of rows, at least 1; last digits of coordinates do not decide about halves."""
+    return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 
 def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
@@ -192,7 +197,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     if not grid.even:
         rows = [_rows(grid, a, lower[a], upper[a], per_cell) for a in range(grid.dim)]
         return check_inside(grid, _lattice(rows, material=material))
-    count = np.maximum(1, np.rint((upper - lower) / (grid.h / per_cell))).astype(int)
+    count = _rounded((upper - lower) / (grid.h / per_cell))
     lattice = {"origin": lower, "spacing": (upper - lower) / count, "count": tuple(count.tolist())}
     return check_inside(grid, LatticeBody(**lattice, material=material))
 

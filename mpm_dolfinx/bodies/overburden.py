@@ -24,14 +24,8 @@ def overburden(
 
     Both are means over vertical lines close to a position, on all sides, because borders of domains may lie above it.
 
-    Parameters
-    ----------
-    corners : (n, 2^d, d), m
-        Corners of the particle domains of all bodies; the last axis is vertical.
-    unit_weight : (n,), N/m^3
-        Unit weights of the domains.
-    x : (m, d), m
-        Positions in the domains.
+    corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
+    N/m^3: unit weights of the domains; x (m, d), m: positions in the domains.
     """
     least = np.ptp(corners[..., :-1], axis=1).min(initial=np.inf)
     aside = SAME * least * np.sqrt([2.0, 3.0])[: x.shape[1] - 1] * (1 - 2 * corner_bits(x.shape[1] - 1))

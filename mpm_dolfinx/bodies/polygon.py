@@ -71,7 +71,7 @@ def polygon(
         inner = _outline(f"hole {name!r}", inner)
         loops.append((inner, [name] * len(inner)))
     if size is None and not grid.even:
-        raise ValueError("polygon: size = None, must be given on a grid of unequal cells, m")
+        raise ValueError("polygon: size = None, must be a length in m, because the grid has unequal cells")
     default = grid.least / whole("body: per_cell", per_cell)
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])

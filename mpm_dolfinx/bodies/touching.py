@@ -269,14 +269,8 @@ def uncovered(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the rectangles of faces that no box covers: for each its face (m,), lower and upper corner (m, 2).
 
-    Parameters
-    ----------
-    count
-        Number of faces.
-    face, low, high : (n,), (n, 2), (n, 2)
-        Faces, and the boxes that cover parts of them, in face coordinates from 0 to 1.
-    slack : (n,)
-        Largest difference between the ends of boxes that count as equal.
+    count: number of faces; face (n,): faces; low, high (n, 2): corners of the boxes that cover parts of these faces, in
+    face coordinates from 0 to 1; slack (n,): largest difference between the ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)
@@ -336,7 +330,8 @@ def uncovered(
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gaps (n,), m, between convex domains a and b (n, 2^d, d), m; a negative gap is the depth of overlap.
 
-    Domains overlap unless a plane separates them.  It can be parallel to a face or, in 3D, to an edge of each domain.
+    Domains overlap unless a plane separates them.  The plane may be parallel to a face or, in 3D, to an edge of each
+    domain.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))

@@ -48,14 +48,7 @@ MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 class FormsOf:
     """Compiled forms of the conditions of a scene.  Each kind of form is compiled at the first use.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    u
-        Displacement increment of the step, m.
-    velocity
-        Velocity of the bodies in a substep.
+    grid: background grid; u: displacement increment of the step, m; velocity: velocity of the bodies in a substep.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
@@ -125,7 +118,7 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Displacement increment u of the step (a local array), m, the numbering of unknowns, and connected parts."""
+    """Displacement increment u of the step, a local array, m; numbering of the unknowns; connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
@@ -203,7 +196,7 @@ class Loads:
         """Subtract forces at u from the residual of unknowns or fixed components.  The residual's scale omits them."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return the inertia forces at u, N, or None.  They enter the residual and its scale."""
+        """Return the inertia forces at u, N, or None.  These forces enter the residual and its scale."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` adds to the pattern of the cells, or None."""
@@ -231,7 +224,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled local dofs (n,) on walls, and the forces on them (n,), N, that are not reactions of walls."""
+        """Return local dofs (n,) on walls, unrolled, and loads (n,), N, there that are not part of the reactions."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:

@@ -96,9 +96,9 @@ class Pressure(Condition):
     """Pressure on a side of the bodies: always normal to the moving surface, per current area.
 
     The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
-    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if its surface is
-    closed, or ends at walls that fix its edges.  Without a potential the tangent is unsymmetric (LU, FGMRES), and the
-    stability of dry equilibria is not checked.
+    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if the loaded surface
+    is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric (LU,
+    FGMRES), and the stability of dry equilibria is not checked.
 
     Parameters
     ----------
@@ -129,9 +129,9 @@ class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
     The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
-    the normal and rho c_s in the tangent plane.  Waves along the normal are absorbed completely; a few per cent of
-    oblique waves are reflected.  A side that was fixed in a stage without inertia keeps its tractions.  Bodies with
-    weight need such a stage.
+    the normal and rho c_s in the tangent plane.  rho is the density; c_p and c_s are the speeds of compression and
+    shear waves.  Waves along the normal are absorbed completely; a few per cent of oblique waves are reflected.  A side
+    that was fixed in a stage without inertia keeps its tractions.  Bodies with weight need such a stage.
 
     Parameters
     ----------
@@ -390,9 +390,9 @@ RIGIDITY = 1e4
 HOLD = 3e2
 """Penalty stiffness for cell means of prescribed displacements, in units of (modulus from `holding`) / (cell size).
 
-The displacement error is (change of traction in the step, except by rotation) / (modulus) x (cell size) / HOLD.  It
-does not accumulate, because each step measures it from the prescribed position.  Where a body is much stiffer than the
-penalty, multipliers remove the error, see `HoldLoads.augment`.
+The displacement error is (change of traction in the step, except by rotation) / (modulus) x (cell size) / HOLD.  The
+error does not accumulate, because each step measures the error from the prescribed position.  Where a body is much
+stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
 
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.
@@ -430,13 +430,13 @@ class Displacement(Condition):
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement since the start, or since a stage reset it, at reference positions X (m, d).  For a mapped body,
-        the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
+        Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  For a mapped
+        body, the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
     components
         Prescribed components, such as "y"; by default all.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  The last prescribed node also moves half a cell of
-        the side outside the box.  If the box covers at most half of its last cell, that cell's far node stays free.
+        Box of reference positions; faces inside it are prescribed.  Let the box end within a cell.  The cell's node
+        outside the box is prescribed if the box covers more than half of the cell, otherwise free.
 
     Raises
     ------
@@ -475,7 +475,8 @@ class _OfPlate(Traction):
 class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies: all faces have the same displacement normal to the side.
 
-    A penalty on the slope of the faces, kappa/2 int (grad_t x_n)^2 dA, keeps the plate flat and prevents tilting.  The
+    A penalty kappa/2 int (grad_t x_n)^2 dA on the slope of the faces keeps the plate flat and prevents tilting.  x_n is
+    the position along the normal, grad_t the gradient along the side, and kappa the stiffness from `RIGIDITY`.  The
     penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters

@@ -21,12 +21,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 class Sides:
     """Finder of the faces on which a condition acts.  Conditions on the same faces share one `Surface`.
 
-    Parameters
-    ----------
-    grid, bodies
-        Background grid and all bodies of the scene.
-    present
-        Which bodies are active in the stage.
+    grid, bodies: background grid and all bodies of the scene; present: which bodies are active in the stage.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
@@ -59,17 +54,12 @@ class Sides:
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
         """Return the faces of a prescribed displacement, without cells that the region covers by at most one half.
 
-        The last prescribed node also moves half a cell outside the region.  If the region covers at most half of its
-        last cell, the faces therefore end at the inner side of this cell.  On a side inclined to the grid, they end
-        half a cell before the end of the region.  This applies only where the side continues outside the region and no
-        other condition prescribes the same components there.
+        The last prescribed node also moves half a cell of the side outside the region.  If the region covers at most
+        half of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side
+        inclined to the grid, the faces end half a cell before the end of the region.  Both apply only where the side
+        continues outside the region and no other condition prescribes the same components there.
 
-        Parameters
-        ----------
-        condition
-            The prescribed displacement.
-        others
-            Other prescribed displacements of the same components.
+        condition: the prescribed displacement; others: other prescribed displacements of the same components.
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X

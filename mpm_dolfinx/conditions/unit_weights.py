@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid.  If the scene's gravity, m/s^2, is constant, it converts the fluid's conductivity."""
+    """Return the fluid.  If the scene's gravity, m/s^2, is constant, conductivities refer to this gravity."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure.  If it has no unit weight, it gets the unit weight of the pore fluid."""
+    """Return a water pressure; a pressure without a unit weight gets the unit weight of the pore fluid."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 
@@ -75,10 +75,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 
     In a dry scene, warn about each level whose unit weight is not that of water under the scene's gravity.
 
-    Parameters
-    ----------
-    levels
-        Name and water pressure of each level.
+    levels: name and water pressure of each level.
     """
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
     if fluid is None:
@@ -90,16 +87,14 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(comm, ConditionWarning, f"{what}: at one level, the two are not in equilibrium", name, weight, of, own)
+            what = f"{what}: at equal levels, these waters are not in equilibrium"
+            warn(comm, ConditionWarning, what, name, weight, of, own)
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
     """Return the last gravity, m/s^2, if conductivities are converted with another one, else None.
 
-    Parameters
-    ----------
-    gravity
-        Gravity at the start of a step, and at times in it, m/s^2.  If it varies, it counts only above 9.81 m/s^2.
+    gravity, m/s^2: at the start of a step, and at times in the step.  A varying gravity counts only above 9.81 m/s^2.
     """
     first, last = gravity[0], float(np.linalg.norm(gravity[-1]))
     rests = all(np.array_equal(first, g) for g in gravity) and last > 0

@@ -69,12 +69,8 @@ def wall_forces(
     If several walls fix a component of a node, the wall normal to this component carries the force, or all of them
     carry it evenly if none is normal.  The axis of revolution has no area, so its radial force is zero.
 
-    Parameters
-    ----------
-    dofs : (n,)
-        Local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.
-    forces : (n,), N
-        Forces on these degrees of freedom.
+    dofs (n,): local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored. forces (n,),
+    N: forces on these degrees of freedom.
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)

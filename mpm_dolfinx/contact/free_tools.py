@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Free tools: rigid tools with a mass, which weight, loads and contact forces move.
 
-Let q be the motion of a tool in a step: its displacement and, in 2D, its rotation.  As for nodes
-(`mechanics/inertia.py`), m (q - q^) / (own dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, q^ is the
-motion without forces in the step, l is the load, and f are the contact forces on the points.  A q is the displacement
-of the contact positions on the tool.  The columns of A are e_x, e_y, and e_z x r with the lever arm r.
+Let q be the motion of a tool in a step: displacement and, in 2D, rotation.  The equation of motion has the form of that
+of nodes (`mechanics/inertia.py`), m (q - q^) / (g dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, and q^
+is the motion without forces in the step.  g is the weight of the substep's rate, and dt is the length of the step.  l
+is the load, and f are the contact forces on the points.  A q is the displacement of the contact positions on the tool.
+The columns of A are e_x, e_y, and e_z x r with the lever arm r.
 
 The unknowns q are condensed.  Let D be minus the derivative of f by the displacement of the points, and dw the
 increment of this displacement.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns 0,
@@ -12,9 +13,9 @@ increment of this displacement.  Forces rotate with the tool, so f changes by (D
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
-With S, the sum of this matrix and m / (own dt)^2, Newton's method gives
+With S, the sum of this matrix and m / (g dt)^2, Newton's method gives
 
-    dq = S^-1 (l - sum A^T f - m (q - q^) / (own dt)^2 + sum (A^T D + E^T) dw).
+    dq = S^-1 (l - sum A^T f - m (q - q^) / (g dt)^2 + sum (A^T D + E^T) dw).
 
 Forces on the points are therefore f + (D A + E) S^-1 (...); minus their derivative is
 D - (D A + E) S^-1 (A^T D + E^T).
@@ -56,15 +57,9 @@ class MotionEquation(NamedTuple):
 class FreeTools(ContactProblem):
     """Base class that adds the motion of free tools to `ToolLoads`.
 
-    Parameters
-    ----------
-    placed
-        Arguments of `ToolLoads`.
-    mass, guides
-        `mass`: masses and moments of inertia (k, q), kg and kg m^2, 0 for tools that are not free.  `guides`:
-        projections (k, q, q) on the motions that each tool can perform, see `motion_count`.
-    velocity, pushes
-        `velocity`: velocities (k, q), m/s and rad/s, at the start of the step.  `pushes`: loads (k, q), N and N m.
+    placed: arguments of `ToolLoads`; mass (k, q): masses, kg, and moments of inertia, kg m^2, 0 for tools that are not
+    free; guides (k, q, q): projections on the motions that each tool can perform, see `motion_count`; velocity (k, q):
+    velocities at the start of the step, m/s and rad/s; pushes (k, q): loads, N and N m.
     """
 
     couples = True

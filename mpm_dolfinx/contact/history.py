@@ -63,7 +63,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Return the origin of the flagged pairs (m,) of two contacts, and the indices of these pairs in its order."""
+    """Return the origin of the flagged pairs (m,) of two contacts, and the order of these pairs in the origin."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

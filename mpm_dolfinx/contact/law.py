@@ -5,14 +5,15 @@ At a position with gap g, the contact pressure and its energy per area are
 
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
-The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier lambda has one value for each
-contact and cell, which starts from the pressure of the previous step.  Augmentation (Uzawa's method) updates lambda
-until the mean penetration in each cell is below `DEPTH`.  Friction depends on means over the pairs in a cell: the slip
-s in the step, and the shear traction t_n after the previous step,
+<...> is the positive part.  The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier
+lambda has one value for each contact and cell, which starts from the pressure of the previous step.  Augmentation
+(Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`.  Friction depends on means
+over the pairs in a cell: the slip s in the step, and the shear traction t_n after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
-with the projection P on the tangent plane.  Sticking contact is elastic with stiffness k_t.
+with the projection P on the tangent plane and Coulomb's coefficient mu.  Sticking contact is elastic with stiffness
+k_t.
 
 The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
 cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
@@ -41,7 +42,9 @@ from mpm_dolfinx.parallel.exchange import first, over_all
 STIFF = 100.0
 """Stiffness k in units of (resistance) / (cell size)."""
 GRIP = 6.0
-"""Stiffness k_t in units of (resistance) / (cell size).  A larger k_t allows shears that cancel at the nodes."""
+"""Stiffness k_t in units of (resistance) / (cell size).  With a larger k_t, spurious shear stresses would alternate
+between cells: their nodal forces cancel, so nothing would resist them.
+"""
 DEPTH = 5e-4  # allowed mean penetration / cell size
 SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
 ROUNDS = 20  # largest number of augmentations
@@ -88,12 +91,7 @@ class Touch:
 class ContactLaw:
     """Contact pressures, shear tractions and their derivatives in a substep.
 
-    Parameters
-    ----------
-    names, contacts
-        Names of the contacts, and the contacts.
-    pairs
-        Possible contact pairs.
+    names: names of the `contacts`; pairs: possible contact pairs.
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):

@@ -46,7 +46,7 @@ DEEP = 0.25
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""(Distance from points on the other surface) / cell size below which corners follow the Q1 field."""
+"""(Distance from points on the other surface) / cell size below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
 """Upper bound of the number of quadrature points of a process on a surface."""
 
@@ -73,13 +73,7 @@ class Pairs(NamedTuple):
 
 
 class Contacts(Touching):
-    """The contacts between groups in a stage.
-
-    Parameters
-    ----------
-    setting, contacts
-        Data of the stage, and its contacts by name.
-    """
+    """The contacts between groups in a stage; setting: data of the stage; contacts: by name."""
 
     conditions, title = (Contact,), "contacts"
 
@@ -97,7 +91,7 @@ class Contacts(Touching):
         self._cell_pairs: Latest[NDArray[np.int64]] = Latest()
 
     def placed(self, place: Place) -> Loads:
-        """Return the loads by contact between groups in a substep."""
+        """Return the contact loads between groups in a substep."""
         cut, points = place.cut, place.points
         found = self._found(cut.key, lambda: self._opposite_all(cut, cut.points), self.grid.comm)
         cell_pairs = partial(self._cell_pairs, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
@@ -251,10 +245,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains are near another group, and follow the Q1 field alone.
-
-        `points` are the points at the start of the step.
-        """
+        """Return which corners (n, 2^d, d) are near another group; points: at the start of the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
@@ -308,14 +299,9 @@ class Contacts(Touching):
 
 
 class ContactLoads(ContactProblem):
-    """Loads by contact between groups; the contact pairs follow the motion of the bodies.
+    """Contact loads between groups; the contact pairs follow the motion of the bodies.
 
-    Parameters
-    ----------
-    contacts, cut
-        Contacts, and cut particle domains.
-    law, origin, again, cell_pairs
-        See `ContactProblem`.
+    cut: cut particle domains; law, origin, again, cell_pairs: see `ContactProblem`.
     """
 
     def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
@@ -338,7 +324,7 @@ class ContactLoads(ContactProblem):
 def _ranks(setting: Setting) -> NDArray[np.int64]:
     """Return the rank (points,) of the connected part of each point, by surface area and then by extent.
 
-    The order of two parts is the same in all stages, in any order of the bodies, and next to any other part.
+    The ranking of two parts is the same in all stages, in any order of the bodies, and next to any other part.
     """
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])

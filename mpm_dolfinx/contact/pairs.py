@@ -54,8 +54,8 @@ class Pairs:
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at w (m, d), m.
 
-        `motion` (contacts,), m, are displacements of tools by loads in the step.  With free tools its shape is
-        (contacts, q): displacements, m, and rotations, rad.
+        `motion` (contacts,), m: displacements of tools that loads cause in the step; with free tools (contacts, q):
+        displacements, m, and rotations, rad.
         """
         raise NotImplementedError
 

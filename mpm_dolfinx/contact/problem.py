@@ -4,8 +4,8 @@
 A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
 With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
-at the start of the step.  After convergence they are updated at the new positions, and the step is solved again.  This
-is repeated until an update changes the gaps by less than `DEPTH` cells.
+at the start of the step.  After convergence, pairs, normals and gaps are updated at the new positions, and the step is
+solved again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
 the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
@@ -57,8 +57,8 @@ class Pushes:
 class LinearMotion:
     """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-    The displacements are motion + shift + sum slope . (w' - w); the sum is over the pairs of a tool.  Newton's method
-    uses this linear function.
+    The displacements are `motion` + `shift` + sum `slope` . (w' - w); the sum is over the pairs of a tool.  Newton's
+    method uses this linear function.
     """
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
@@ -94,13 +94,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of one kind in a stage: either tools, or contacts between groups.
-
-    Parameters
-    ----------
-    setting, given
-        Data of the stage, and its tools or contacts by name.
-    """
+    """Contact conditions of one kind in a stage; given: its tools, or its contacts between groups, by name."""
 
     linear = False
 
@@ -275,7 +269,7 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements of tools by loads at w (m, d), m, from the last linearisation.
+        """Return the displacements of tools that loads cause at w (m, d), m, from the last linearisation.
 
         Shape (tools,), or before the first substep of free tools (tools, q).
         """
@@ -307,10 +301,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the displacements (tools,), m, at which one contact point would carry the load, and which tools touch.
-
-        A displacement is infinite if there is no such point.
-        """
+        """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
         law = self.now.law
         state = self.now.state
         of = self.pairs.number
@@ -458,7 +449,7 @@ class ContactProblem(Loads):
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`: forces and moments on the bodies, (3,) or in 3D (6,), N, N m, and displacements by loads, m."""
+        """See `Loads`: forces, N, and moments, N m, on the bodies (3,), in 3D (6,); displacements due to loads, m."""
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}

@@ -170,7 +170,9 @@ class Convex:
             except QhullError:
                 what = f"Convex: corners = {line(self.corners)}: lie in one line or plane"
         if what:
-            raise ValueError(f"{what}, must be at least d + 1 places of d = 2 or 3 coordinates that span a solid")
+            raise ValueError(
+                f"{what}, must be 3 or more places (x, y), not on a line, or 4 or more (x, y, z), not in a plane"
+            )
 
     @cached_property
     def _planes(self) -> NDArray[np.float64]:

@@ -109,10 +109,14 @@ class TieLoads(Loads):
 
     Parameters
     ----------
-    cell, x : (m,), (m, d), m
-        Local cells, and positions in them, on one side.
-    other, y : (m,), (m, d), m
-        Lexicographic cells of any process, and positions in them, on the other side.
+    cell : (m,)
+        Local cells on one side.
+    x : (m, d), m
+        Positions in these cells.
+    other : (m,)
+        Lexicographic cells of any process on the other side.
+    y : (m, d), m
+        Positions in the cells `other`.
     stiffness : (m,), N/m
         Penalty stiffness.
     gap : (m, d), m

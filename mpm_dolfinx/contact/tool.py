@@ -46,7 +46,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after further motion `by_forces`: displacement (d,), m, and then a rotation, rad, if any."""
+        """Return the pose after a further motion `by_forces`: displacement (d,), m, and a rotation, rad, if any."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
@@ -58,7 +58,7 @@ def rotation(angle: float) -> NDArray[np.float64]:
 
 
 def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return, from an outcome, the displacement of a tool by forces, m, then its rotation by forces, rad, if any."""
+    """Return a tool's motion due to forces, from an outcome: displacement, m, and the rotation, rad, if any."""
     angle = outcome.get("tool_rotation", {})
     by_forces = outcome["tool_travel"][name]
     return np.append(by_forces, angle[name]) if name in angle else by_forces
@@ -80,13 +80,13 @@ class Tool:
     rotation_rad : float or callable t (s) -> float, rad
         Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
     centre : (d,), m
-        Centre of rotation, reference of moments, and centre of mass of a free tool.  It moves with the tool.  By
-        default the centroid of a free disc or polygon, else the origin.
+        Centre of rotation, reference of moments, and centre of mass of a free tool.  The centre moves with the tool.
+        By default the centroid of a free disc or polygon, else the origin.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0.  Where it exceeds ten times the normal pressure, it is
-        reduced to that value.  For undrained soil: alpha s_u, with friction 0.
+        Additional shear strength of the contact, Pa, >= 0.  An adhesion above ten times the normal pressure is reduced
+        to this value.  For undrained soil: alpha s_u, with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
         The tool moves along `direction`, in addition to its displacement, until the reaction equals the load, from the
         first step on.  The tool must start in contact, or less than a cell away.  `tool_travel` of the simulation
@@ -281,10 +281,7 @@ class Tool:
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at time t (s), after an additional displacement `by_forces`, m, caused by the applied load.
-
-        For a free tool, `by_forces` is a vector, followed by the rotation, rad.
-        """
+        """Return the pose at t (s); by_forces: motion due to forces, m; for a free tool (d,) and the rotation, rad."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
@@ -297,8 +294,8 @@ class Tool:
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid cells inside the tool at time t (s), for pictures.
 
-        `by_forces` is the displacement by forces, m, see `pose`.  Corners outside the tool are projected onto its
-        surface, so edges are blunt by a fraction of a cell.
+        `by_forces`: see `pose`.  Corners outside the tool are projected onto its surface, so edges are blunt by a
+        fraction of a cell.
         """
         pose = self.pose(t, grid.dim, by_forces)
         solid = self.solid(grid.least)

@@ -49,7 +49,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements of tools by loads, m, at start and end of a step; with free tools (k, q), rotations included."""
+    """Displacements, m, of k tools due to loads, at start and end of a step; with free tools (k, q), with rotations."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -63,13 +63,7 @@ class LoadMotion(NamedTuple):
 
 
 class Tools(Touching):
-    """The tools of a stage, with their motion in a step.
-
-    Parameters
-    ----------
-    setting, tools
-        Data of the stage, and its tools by name.
-    """
+    """The tools of a stage, with their motion in a step; setting: data of the stage; tools: by name."""
 
     conditions, title = (Tool,), "tools"
 
@@ -136,7 +130,7 @@ class Tools(Touching):
         return out
 
     def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
-        """Return the tools with their displacements by loads in a step.  `end` is the end of a step with inertia, s."""
+        """Return the tools with the motion that loads cause in a step.  `end` is the end of a step with inertia, s."""
         tools = copy(self)
         tools.by_loads, tools._end = by_loads, end
         return tools
@@ -171,7 +165,7 @@ class Tools(Touching):
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments filled with this value, zero displacements by loads, and initial velocities."""
+        """Return forces and moments filled with this value, zero displacements due to loads, and initial velocities."""
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -184,7 +178,7 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements by loads (tools,), m, before a step; with free tools (tools, q), with rotations, rad."""
+        """Return displacements due to loads before a step, m: (tools,), with free tools (tools, q) with rotations."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
@@ -199,7 +193,7 @@ class Tools(Touching):
         return out
 
     def placed(self, place: Place) -> Loads:
-        """Return the loads by contact with tools in a substep; without inertia free tools keep their position."""
+        """Return the contact loads of tools in a substep; without inertia free tools keep their position."""
         before = self._before(place)
         tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
         if not (self.free and place.inertia):  # an initial stress is balanced without inertia
@@ -308,7 +302,7 @@ class Tools(Touching):
             held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
                 where = where if deep > NEAR else at_middle
-                raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
+                raise NotConverged(f"{line(tool)}: has passed through the surface, to {where}; renewal may help")
             if where := self._passed(tool, (before.x, points.x), (place.start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
@@ -387,13 +381,7 @@ class Tools(Touching):
 
 
 class ToolLoads(ContactProblem):
-    """Loads by contact with tools in a substep.
-
-    Parameters
-    ----------
-    tools, place
-        Tools with their motion in the step, and positions and times of the substep.
-    """
+    """Contact loads of tools in a substep; tools: with their motion in the step; place: positions and times."""
 
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))
@@ -424,7 +412,7 @@ class ToolLoads(ContactProblem):
         return moved / self.shares.own
 
     def ended(self, at: At) -> Loads:
-        """Return the loads by contact with the tools at their final positions."""
+        """Return the contact loads of the tools at their final positions."""
         out = copy(self)
         by_loads = self._tools.by_loads
         out._tools = self._tools.going(by_loads._replace(after=by_loads.before + self.found(at).motion))
@@ -441,9 +429,9 @@ class ToolLoads(ContactProblem):
         return self._tools.pushed_out(corners, self._place.t, free, np.inf if everywhere else NEAR)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if a tool has passed through a body, or lies inside one."""
+        """See `Loads`."""
         self._tools.check_end(self._place, points, before)
 
 
 class FreeToolLoads(FreeTools, ToolLoads):
-    """Loads by contact with tools, among them free tools."""
+    """Contact loads of tools, among them free tools."""

@@ -111,8 +111,8 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
     """Return for owned cells (n,) the lost volume of the softest material, m^d, the contrast, and one of its pieces.
 
     With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
-    cell gives 1 / sum s M instead.  The loss is the difference of both, divided by the largest 1/M.  It is at most
-    (1 - sqrt(r))^2 of the cell for two moduli of ratio r < 1.
+    cell gives 1 / sum s M instead.  The loss is the difference of both, divided by the largest 1/M.  The loss is at
+    most (1 - sqrt(r))^2 of the cell for two moduli of ratio r < 1.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))

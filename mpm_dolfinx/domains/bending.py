@@ -7,11 +7,12 @@ and the sawtooth remains as stress.  The corner displacement therefore contains 
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
-with the position t_a along axis a in the cell, from 0 to 1.  This field is exact for quadratic displacements, equal to
-Q1 at the nodes, and continuous.  D_a belongs to the cell edge along axis a that ends at node i.  It is the second
-difference at one end of this edge: the smaller one in absolute value, or zero if their signs differ.  If only one end
-has a second difference, D_a is this one.  If cell sizes vary, D_a is the squared edge length times the second
-derivative of a parabola.  Physical kinks, for example at the boundary of two materials, are kept.
+with the shape functions N_i, the nodal displacements u_i, and the position t_a along axis a in the cell, from 0 to 1.
+This field is exact for quadratic displacements, equal to Q1 at the nodes, and continuous.  D_a belongs to the cell edge
+along axis a that ends at node i.  D_a is the second difference at one end of this edge: the smaller one in absolute
+value, or zero if their signs differ.  If only one end has a second difference, D_a is this one.  If cell sizes vary,
+D_a is the squared edge length times the second derivative of a parabola.  Physical kinks, for example at the boundary
+of two materials, are kept.
 """
 
 from __future__ import annotations
@@ -27,14 +28,9 @@ def followed(
 ) -> NDArray[np.float64]:
     """Return two fields (2, n, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
-    Parameters
-    ----------
-    cells, x : (n,), (n, d), m
-        Owned cells that contain the corners, and positions of the corners.
-    u : (nodes, d), m
-        Nodal displacements.
-    filled : (cells,)
-        Whether local cells contain material.  Nodes beyond empty cells are not used: they may be of another body.
+    cells (n,): owned cells that contain the corners; x (n, d), m: positions of the corners; u (nodes, d), m: nodal
+    displacements; filled (cells,): whether local cells contain material.  Nodes beyond empty cells are not used: they
+    may be of another body.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)

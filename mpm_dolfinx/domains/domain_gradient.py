@@ -22,10 +22,7 @@ def gradient(
     second-order term.)  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
     centroid radii, and det F is the ratio of the ring volumes.
 
-    Parameters
-    ----------
-    corners, reference : (n, 2^d, d), m
-        Current corners, and reference corners.
+    corners, reference (n, 2^d, d), m: current corners, and reference corners.
     """
     if corners.shape[2] == 2:
         dx, dX = (y[:, :1:-1] - y[:, :2] for y in (corners, reference))  # the diagonals
@@ -100,15 +97,9 @@ def cell_ratios(
     mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
     volumes are meaningless near plastic flow.
 
-    Parameters
-    ----------
-    cut, points
-        Cut particle domains, and points at the start of the step.
-    share : (n,)
-        Weight, in [0, 1], of the ratio from corners in its geometric mean with the ratio of the point; 0 without mean
-        dilatation.
-    flows : (n,)
-        Whether points have yielded.
+    cut, points: cut particle domains, and points at the start of the step; share (n,): weight, in [0, 1], of the ratio
+    from corners in the geometric mean of this ratio and the ratio of the point; 0 without mean dilatation.  flows (n,):
+    whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

@@ -94,10 +94,7 @@ class Neighbours:
 class LinearGradients:
     """Deformation gradients at the pieces of the domains in a scene.
 
-    Parameters
-    ----------
-    comm, bodies
-        Communicator of the processes, and all bodies of the scene.
+    comm: communicator of the processes; bodies: all bodies of the scene.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
@@ -127,16 +124,8 @@ def linear_gradients(
 ) -> NDArray[np.float64]:
     """Return deformation gradients (m, k, k) at the pieces of this process's points.
 
-    Parameters
-    ----------
-    neighbours
-        Neighbours of the domains in which F may vary.
-    cut
-        Cut particle domains.
-    F : (n, k, k)
-        Deformation gradients of the points.
-    soils : (n, c)
-        Constants of the points' soil.  Points with equal rows have the same material.
+    neighbours: neighbours of the domains in which F may vary; cut: cut particle domains; F (n, k, k): deformation
+    gradients of the points; soils (n, c): constants of the points' soil. Points with equal rows have the same material.
     """
     # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction

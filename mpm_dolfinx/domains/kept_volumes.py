@@ -6,11 +6,12 @@ the cell, and edges stay straight.  In elastic soil F and the volume ratios of c
 yielded soil F is updated by increments, so the volumes of domains and of points would drift apart, and cells would
 overfill.  After a step the corners of yielded domains therefore move by the d that minimises
 
-    sum_p ((V_p - V - dV/dx d) / |dV/dx|)^2 + SOFT^2 |d|^2,
+    sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 
-with the volumes V_p of points and V of their domains.  Shared corners move together.  Corners of elastic domains and
-held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit density
-projection).  Volumes of domains, unlike densities, need no second cut by the grid.
+with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells.  Both sums
+are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of elastic
+domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit
+density projection).  Volumes of domains, unlike densities, need no second cut by the grid.
 """
 
 from __future__ import annotations
@@ -30,9 +31,8 @@ from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
 """Weight of the motion d, needed because in regular lattices no motion changes alternating volumes to first order.
-Halving this value changes the result of scene "flow" in tests/plateaus.py by 1.3e-04 (relative), doubling it by
-3.2e-04, and finer cells by 9.2e-02.
-"""
+Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04 (relative), doubling it by
+1.4e-04, and finer cells by 9.2e-02."""
 
 
 class Domains(NamedTuple):
@@ -66,14 +66,18 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     fixed = ~(domains.free & yielded[:, None, None])
     held = np.stack([np.bincount(number.ravel(), fixed[:, :, a].ravel(), count) > 0 for a in range(d)], axis=1)
     now, slope = volume_slopes(domains.corners[yielded], grid.axisymmetric)
-    size = np.linalg.norm(slope, axis=(1, 2))
-    at = number[yielded]
-    columns = at[:, :, None] * d + np.arange(d)
-    values = slope / size[:, None, None] * ~held[at]
-    starts = np.arange(len(at) + 1) * columns[:1].size
-    A = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(at), count * d))
-    missing = (domains.volume[yielded] - now) / size
-    return lsmr(A, missing, damp=SOFT, atol=SAME, btol=SAME)[0].reshape(-1, d)[number]
+    at, whole = number[yielded], domains.volume[yielded]
+    n, corners = at.shape
+    share = whole[:, None] / corners / grid.sizes_at(domains.corners[yielded].mean(axis=1)) ** 2
+    weight = np.stack([np.bincount(at.ravel(), column.repeat(corners), count) for column in share.T], axis=1)
+    scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
+    # the unknowns are weighted motions and errors e, so that rows may be scaled: narrow domains have large slopes
+    values = np.column_stack([(slope * scale[at]).reshape(n, -1) / np.sqrt(whole)[:, None], np.full(n, SOFT)])
+    columns = np.column_stack([(at[:, :, None] * d + np.arange(d)).reshape(n, -1), count * d + np.arange(n)])
+    size = np.linalg.norm(values, axis=1)
+    A = csr_matrix(((values / size[:, None]).ravel(), columns.ravel(), np.arange(n + 1) * columns.shape[1]))
+    found = lsmr(A, (whole - now) / np.sqrt(whole) / size, atol=SAME**1.5, btol=SAME**1.5)[0]
+    return (found[: count * d].reshape(-1, d) * scale)[number]
 
 
 def _joined(

@@ -49,14 +49,9 @@ MARGIN = len(THIRD) - 1
 class Lattice:
     """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
 
-    Parameters
-    ----------
-    body, start
-        The body, and the identifier of its first point.
-    given : (faces, axes)
-        Faces on which a condition prescribes displacements, and the prescribed components.
-    contacts : (rows, corners)
-        Domains (m,) that touch other bodies, and the corners (m, 4) of the touching faces.
+    start: identifier of the body's first point; given: pairs of faces on which a condition prescribes displacements,
+    and the prescribed axes; contacts: pairs of domains (m,) that touch other bodies, and the corners (m, 4) of the
+    touching faces.
     """
 
     def __init__(

@@ -114,13 +114,7 @@ class CellPressures(NamedTuple):
 
 
 class Reconstruction:
-    """Limited slopes of cellwise values on the owned cells of a grid.
-
-    Parameters
-    ----------
-    grid
-        Background grid.
-    """
+    """Limited slopes of cellwise values on the owned cells of a grid."""
 
     def __init__(self, grid: Grid):
         self.grid = grid
@@ -171,12 +165,8 @@ class Reconstruction:
         extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
         stay between the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
 
-        Parameters
-        ----------
-        x : (m, d), m
-            Positions relative to the midpoints of their cells.
-        slot : (m,)
-            Index of the cell of each position among the owned cells.
+        x (m, d), m: positions relative to the midpoints of their cells; slot (m,): index of the cell of each position
+        among the owned cells.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, is_open, drained = self._differences(pressures)

@@ -79,14 +79,8 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
 class RefilledCells:
     """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
-    Parameters
-    ----------
-    grid, points, body
-        Background grid, material points, and the index (n,) of each point's body.
-    flowed, needs
-        Whether points (n,) may be renewed, and whether their domains (n,) need renewal.
-    faces, signs
-        Surface of the bodies, and the conditions on its faces, see `_signatures`.
+    body (n,): index of each point's body; flowed (n,): whether points may be renewed; needs (n,): whether their domains
+    need renewal; faces: surface of the bodies; signs: the conditions on these faces, see `Renewal._signatures`.
     """
 
     def __init__(
@@ -128,7 +122,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed, due to points that have not flowed, several bodies or conditions."""
+        """Return which cells cannot be renewed, due to points not `flowed`, several bodies, or conditions on faces."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -364,9 +358,9 @@ class RefilledCells:
         polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
-        large = Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece])
-        piece, quads = piece[large], quads[large]
-        edge = edge[large]
+        large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
+        large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # crumbs change no numbers
+        piece, quads, edge = (values[large] for values in (piece, quads, edge))
         left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
         corners[:, RING] = quads

@@ -25,7 +25,7 @@ def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with data of renewed faces.  If the data are missing, add data without renewed faces."""
+    """Return the points; if they lack the data of renewed faces, add these data with the values for no such faces."""
     if PARENT in points.data:
         return points
     n = len(points)

@@ -29,8 +29,8 @@ def balancing_tractions(
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Return for each side at rest point ids (m,) and tractions (m, d), Pa, that replace its reactions.
 
-    Tractions are forces per reference area, computed from the stresses.  Their resultants and moments on a part of the
-    bodies may differ from those of the reactions.  Rigid-body fields of tractions remove this difference.
+    Tractions are forces per reference area, computed from the stresses.  On a part of the bodies, resultants and
+    moments of tractions and of reactions may differ.  Rigid-body fields of tractions remove this difference.
 
     Parameters
     ----------

@@ -19,18 +19,14 @@ def motion_error(
 ) -> tuple[float, float]:
     """Return estimated error and size of a step's motion, both as square roots of twice an energy, J^(1/2).
 
-    The difference to a first-order step is `seconds` * (a2 - a1) in velocities and `seconds` * (v2 - v1) in
-    displacements.  The matrix of the substep bounds this difference for unresolved modes, as in Hosea and Shampine
-    (1996).  The estimate is ERROR times this difference; the error of a resolved mode is 0.081 omega dt times it.
+    The substeps end with the velocities v1, v2 and accelerations a1, a2.  The difference to a first-order step is
+    `seconds` * (a2 - a1) in velocities and `seconds` * (v2 - v1) in displacements.  The matrix of the substep bounds
+    this difference for unresolved modes, as in Hosea and Shampine (1996).  The estimate is ERROR times this difference.
+    The error of a resolved mode of angular frequency omega in a step dt is 0.081 omega dt times this difference.
 
-    Parameters
-    ----------
-    solvers, K, mass
-        Solvers, momentum tangent and mass of the last substep.
-    flights
-        States of motion after the two substeps.
-    seconds, own
-        Time weights in the last substep, s: `seconds` of the rate in the first substep, `own` of the rate in the last.
+    solvers, mass: of the last substep; K: its momentum tangent; flights: states of motion after the two substeps;
+    seconds, own: time weights in the last substep, s, of the rate in the first substep (`seconds`) and in the last
+    (`own`).
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

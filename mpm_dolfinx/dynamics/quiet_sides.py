@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Quiet boundaries: t = t_0 - Z (v - 2 v_in), Z = rho c_p n n + rho c_s (I - n n), v_in: velocity of an incoming wave.
+"""Quiet boundaries with the traction t = t_0 - Z (v - 2 v_in) and the impedance Z = rho c_p n n + rho c_s (I - n n).
 
-t_0 is the constant traction at rest (Lysmer and Kuhlemeyer 1969; incoming waves: Joyner and Chen 1975).  Impedances use
-small-strain moduli of undrained soil.
+t_0 is the constant traction at rest, v the velocity of the side, and v_in that of an incoming wave.  n is the normal,
+rho the density; c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969; incoming waves:
+Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Points on quiet sides: impedance across the normal, its excess along the normal, kg/m^2/s, constant traction."""
+    """Points on quiet sides, with tangential impedance, normal minus tangential impedance, kg/m^2/s, and traction at
+    rest.
+    """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.points = p = FormPoints(grid, normal=(grid.dim,), across=(), along=(), force=(grid.dim,))

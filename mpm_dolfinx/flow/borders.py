@@ -31,8 +31,12 @@ class Borders:
     ----------
     contents
         Material in the cells.
-    cells, soils, law
-        Arrays over the m pieces: cell (m,); constants of the soil (m, k); index of the retention curve (m,).
+    cells : (m,)
+        Cell of each piece.
+    soils : (m, k)
+        Constants of the soil of each piece.
+    law : (m,)
+        Index of the retention curve of each piece.
     facets
         Facets of this process between two active cells.
     mixed
@@ -77,14 +81,9 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        Parameters
-        ----------
-        laws
-            Relative conductivities as functions of pressure, see `Laws`.
-        contents, flow
-            Material in the cells, and conductivities of the filled owned cells.
-        places, moved
-            Vectors (c, d), m, for local cells: from midpoint to pressure position; displacement in the step.
+        laws: relative conductivities as functions of pressure, see `Laws`; contents: material in the cells; flow:
+        conductivities of the filled owned cells; places (c, d), m: vectors from the midpoints of local cells to their
+        pressure positions; moved (c, d), m: displacements of the cells in the step.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1

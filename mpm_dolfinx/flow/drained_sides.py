@@ -2,12 +2,14 @@
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
 The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
-T = A kappa / d, with the distance d from the centroid of the cell's material to the face.  r is the density of the
-fluid divided by the density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set
-method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the others: at the start of the substep
-and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at the pressure of the
-pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V supplies V / dt in a step in
-addition to the rain, uniformly over its side.  Infiltration, ponding and run-off add up to the rain within rounding.
+p is the pressure at the centroid x of the cell's material, and p_out the pressure outside at the face, x_out.  T is A
+kappa / d, with the area A of the face, the mobility kappa (conductivity / unit weight), and the distance d from x to
+the face.  r is the density of the fluid divided by the density at zero pressure.  At a seepage face, fluid can only
+leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the
+others: at the start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most
+the inflow at the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V
+supplies V / dt in a step in addition to the rain, uniformly over its side.  Infiltration, ponding and run-off add up to
+the rain within rounding.
 """
 
 from __future__ import annotations
@@ -35,9 +37,9 @@ from mpm_dolfinx.parallel.exchange import everywhere, over_all
 THICK = np.sqrt(2)
 """(Area of the largest plane section of a cube) / (area of a face).  Source: exact bound (Ball 1986).
 
-Let a convex body of volume V in a cell lie on one side of a plane.  The distance from its centroid to the plane is at
-least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it, bounds only a
-part of the material.  Such a face must not drain the whole cell.
+Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from its centroid to
+the plane is at least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it,
+bounds only a part of the material.  Such a face must not drain the whole cell.
 """
 
 
@@ -186,8 +188,8 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
 
-        Conductivities change by decades in a step, so the correction must be proportional to the flux.  It is limited
-        so that it cannot empty the soil.
+        Conductivities change by decades in a step, so the correction must be proportional to the flux.  Limits prevent
+        that the correction empties the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -250,14 +252,8 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    Parameters
-    ----------
-    sides
-        Faces of the open sides.
-    wet
-        Data of the substep.
-    names, ponds
-        Names of the conditions, and largest pond depths, m, or None without rain; in the order of `OpenSides.number`.
+    sides: faces of the open sides; wet: data of the substep; names: names of the conditions; ponds: largest pond
+    depths, m, or None without rain.  Both have the order of `OpenSides.number`.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):

@@ -2,9 +2,10 @@
 """Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
 
 The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
-fluxes through the deformed cells are pulled back to the start of the step.  With F = I + grad u at the centroid of the
-material in a cell, the cell's mobility kappa becomes J F^-1 kappa F^-T.  `drained_sides` computes fluxes through open
-sides; `StorageProblem` in `storage` adds up both kinds of fluxes.
+fluxes through the deformed cells are pulled back to the start of the step.  kappa is the mobility of a cell
+(conductivity / unit weight).  With F = I + grad u at the centroid of the cell's material, and J = det F, kappa becomes
+J F^-1 kappa F^-T. `drained_sides` computes fluxes through open sides; `StorageProblem` in `storage` adds up both kinds
+of fluxes.
 """
 
 from __future__ import annotations
@@ -158,12 +159,7 @@ class OpenSides:
 
         The values are nan where there is no drained side.
 
-        Parameters
-        ----------
-        at : (m,)
-            Index of the cell of each face among the filled cells.
-        p : (n,), Pa
-            Pressures of the filled cells.
+        at (m,): index of the cell of each face among the filled cells; p (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.einsum("md,md->m", self.offset, self.normal)
@@ -205,14 +201,7 @@ class PieceContents:
 class CellContents(Keyed):
     """Material in the cells, as of the last grid reset.  Arrays over local cells are valid in active cells.
 
-    Parameters
-    ----------
-    forms
-        Forms whose coefficients are set.
-    pieces
-        Contributions of the pieces.
-    filled
-        Owned active cells.
+    forms: forms; this class sets their coefficients.  pieces: contributions of the pieces; filled: owned active cells.
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
@@ -262,7 +251,8 @@ class CellContents(Keyed):
     ) -> NDArray[np.float64]:
         """Set the strength tau of the damping of elastic soil in the filled cells; return tau (n,), 1/Pa.
 
-        `share` (n,) multiplies tau.  `less` (n,), 1/Pa, is the storage by saturation, which is subtracted.
+        `share` (n,) multiplies tau.  `less` (n,), 1/Pa, is the storage due to changes of saturation, which is
+        subtracted.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values

@@ -6,11 +6,12 @@ harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exa
 the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
 conductivity blocks all lines of some cell, and a drain contains complete lines.
 
-The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  The
-resistance from there to the lower end is int (1 - s) dR, to the upper end int s dR, with s in [0, 1] along the line.
-The sum of these resistances is exact for lines through several cells.  For layers inclined by more than `INCLINED` the
-position moves to the more conductive end.  Otherwise a drain would be interrupted between rows of cells.  The shape of
-a piece is approximated by the bounding box of its domain in the cell.
+The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  Let
+R be the resistance of the line, and let s increase from 0 to 1 along the line.  The resistance from this position to
+the lower end is int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through
+several cells.  For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a
+drain would be interrupted between rows of cells.  The shape of a piece is approximated by the bounding box of its
+domain in the cell.
 
 A conductivity that depends on deformation varies even in cells without layers, see `graded`.
 """
@@ -109,7 +110,16 @@ class MixedCells:
         for axis in range(self._x.shape[1]):
             fraction = np.delete(inside, axis, axis=1).prod(axis=1)
             kept = np.flatnonzero(fraction)
-            out.append((line[kept], piece[kept], fraction[kept]))
+            lines, fraction = line[kept], fraction[kept]
+            start, stop = (np.searchsorted(lines, lines, end) for end in ("left", "right"))
+            one, other = ranges(start, stop - start)  # all pairs of pieces on a line
+            a, b = (piece[kept][rows] for rows in (one, other))
+            overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
+            overlap = overlap.clip(0) / np.maximum(high[a] - low[a], NEAR)
+            # deformed boxes may overlap: both count half
+            adjacent = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)
+            counted = fraction + sum_by(one, adjacent * fraction[other] * overlap[:, axis], len(lines))
+            out.append((lines, piece[kept], fraction / np.maximum(counted, 1.0)))
         return out
 
     def mobility(
@@ -164,12 +174,9 @@ class MixedCells:
     ) -> Paths:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
-        Parameters
-        ----------
-        kappa, law
-            Mobilities (m,), m^2/(Pa s), of all pieces at saturation, and indices of their retention curves, < `laws`.
-        shift
-            Vectors (n, d), m, from the centroids of filled cells to their pressure positions; None if all are zero.
+        kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation; law (m,): indices of their retention curves,
+        below `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
+        all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -245,12 +252,8 @@ def graded(
     arithmetic minus the harmonic mean is distributed over the axes, by the variance of a linear variation along each
     axis.
 
-    Parameters
-    ----------
-    offset, kappa
-        Positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa s).
-    mean
-        Mean mobility of the filled cells (n,).
+    offset, kappa: positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa
+    s); mean: mean mobility of the filled cells (n,).
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)

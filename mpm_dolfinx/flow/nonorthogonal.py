@@ -3,12 +3,12 @@
 
 The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
 inclined to the grid, the centroids of both cells also differ by a vector t along the face, up to half a cell.  The
-resulting error does not decrease with h.  With g, the pressure gradient minus the unit weight of the fluid in each
-cell, the corrected flux is
+resulting error does not decrease with the cell size.  With G, the pressure gradient minus the unit weight of the fluid
+in each cell, the corrected flux is (other symbols: see `storage`)
 
-    Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t].
+    Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
-At an open side, p - p_out is replaced by p - p_out + g . t.  Here t is the vector along the side, from the foot of the
+At an open side, p - p_out is replaced by p - p_out + G . t.  Here t is the vector along the side, from the foot of the
 perpendicular through the centroid to the centre of the face.  The gradients are a least-squares fit to the pressures of
 neighbours and drained sides, and to zero flow across no-flow sides.  The area vector of a no-flow side is the one that
 closes the surface of the material in the cell.  Linear pressures are exact.  The gradients are limited: corrected
@@ -54,12 +54,7 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 class Gradients:
     """Gradients of the head in cells that need the non-orthogonal correction: centroids offset along a face or side.
 
-    The object is valid for one cut, and depends only on the geometry of material and sides.
-
-    Parameters
-    ----------
-    contents, sides
-        Material in the cells, and open sides of the bodies.
+    The object is valid for one cut.  contents: material in the cells; sides: open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -135,14 +130,8 @@ class Gradients:
     ) -> NDArray[np.float64]:
         """Return the gradients (rows, d), Pa/m: pressure gradient minus unit weight of the fluid.
 
-        Parameters
-        ----------
-        p : (c,), Pa
-            Pressures of all local cells.
-        outer : (m,), Pa
-            Pressures outside the open sides.
-        weight : (d,), N/m^3
-            Unit weight of the fluid; None without gravity.
+        p (c,), Pa: pressures of all local cells; outer (m,), Pa: pressures outside the open sides; weight (d,), N/m^3:
+        unit weight of the fluid; None without gravity.
         """
         of_cells, of_sides = self._units
         own, at = p[self._own], self._at[self._known]

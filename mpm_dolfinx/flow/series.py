@@ -2,13 +2,13 @@
 """Fluxes between two cells through unsaturated soils in series.
 
 The soils between the pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local
-unknowns of each face.  Newton's method finds them from the continuity of the flux; they are then condensed.  Each soil
-conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers of exponential soil is
-therefore exact at any offset from the grid.
+unknowns of each face.  Newton's method finds these pressures from the continuity of the flux, and condensation
+eliminates them.  Each soil conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through
+layers of exponential soil is therefore exact at any offset from the grid.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  Its soils follow in the order along the lines, each with its mean
-fraction of the length.
+cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over the
+mean of its fractions of the replaced lines.
 """
 
 from __future__ import annotations
@@ -106,18 +106,9 @@ def through(
 ) -> Through:
     """Return the conductances of faces between two pressures.
 
-    Parameters
-    ----------
-    laws
-        Relative conductivities as functions of pressure.
-    p
-        Pressures on both sides (m,), Pa.
-    paths
-        Paths of one or two cells (m, ...), from their pressure positions to the face.
-    lengths
-        Lengths of these paths (m,), m.
-    drops
-        Pressure drops (m,) caused by the fluid's weight along each path, from the first side to the second, Pa.
+    laws: relative conductivities as functions of pressure; p: pressures on both sides (m,), Pa; paths: paths of one or
+    two cells (m, ...), from their pressure positions to the face; lengths: lengths of these paths (m,), m; drops:
+    pressure drops (m,) caused by the fluid's weight along each path, from the first side to the second, Pa.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)

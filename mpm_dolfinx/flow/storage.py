@@ -10,11 +10,12 @@
 the density rho_w at zero pressure.  In the storage term, r is taken at the pressure (p_n + p) / 2; on a face, r is the
 logarithmic mean over both cells.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass
 that leaves a cell enters the neighbour.  The residual is this equation divided by the r of storage; the tangent
-neglects that r of a face differs.  A is the exact area of the body on the face.  x+- are the centroids of the material
-in both cells, and d+- their distances from the face.  `layers` defines kappa and d of mixed cells.  Distances from
-centroids give an error of 0.2 % for any filling; half of the cell size as distance would give up to 12 %.
-`nonorthogonal` corrects faces between centroids that are offset along the face.  The sum over all cells is the bodies'
-balance.  `fluid_content` defines the change of the content, and `time_integration` the integral over a substep.
+neglects that r of a face differs from the r of storage.  A is the exact area of the body on the face, k the
+conductivity.  x+- are the centroids of the material in both cells, and d+- their distances from the face.  `layers`
+defines kappa and d of mixed cells.  Distances from centroids give an error of 0.2 % for any filling; half of the cell
+size as distance would give up to 12 %. `nonorthogonal` corrects faces between centroids that are offset along the face.
+The sum over all cells is the bodies' balance.  `fluid_content` defines the change of the content, and
+`time_integration` the integral over a substep.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
 other cells, and pressure jumps are damped (see below).  Points carry the difference, a volume defect (`owed`).  The
@@ -22,11 +23,12 @@ next steps correct fractions of it (`defect`), at a constant rate over the step.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term max(0, tau d - dt kappa / d) A [p - p_n].  Here d = d+ + d-, and dt, s, is the weight of the rate at p in the step.
-This raises the coefficient dt kappa A / d of a face to tau d A if the coefficient is smaller.  The stabilisation is
-conservative, and vanishes in steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value
-(Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau
-acts on second differences only (`second_differences`), because damping of jumps would smear steep pressures.
+term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength, 1/Pa, d = d+ + d-, and dt, s, is the weight of
+the rate at p in the step.  This raises the coefficient dt kappa A / d of a face to tau d A if the coefficient is
+smaller.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil, tau is a quarter of
+Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred
+times larger.  The increase of tau acts on second differences only (`second_differences`), because damping of jumps
+would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -61,9 +63,9 @@ from mpm_dolfinx.points.parts import OfParts, Parts
 from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
-"""Fraction of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].  Halving
-this value changes the result of scene "beam" in tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and
-finer cells by 1.5e-02.
+"""Fraction of beta V (fixed-stress coefficient times volume) that the filtered fixed-stress operator leaves out for
+checkerboard modes, in [0, 1].  Halving this value changes the result of scene "beam" in tests/plateaus.py by 5.2e-11
+(relative), doubling it by 1.3e-10, and finer cells by 1.5e-02.
 """
 
 
@@ -176,7 +178,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return storage by saturation of filled cells (n,), m^d/Pa, and the integral of S d(chi p)/dp (n,), m^d."""
+        """Return two values (n,) of filled cells: storage due to saturation, m^d/Pa; integral of S d(chi p)/dp, m^d."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -278,7 +280,7 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the residual's change, m^d, by displacements u: of the content and, with `slopes`, of fluxes."""
+        """Set `out` to the residual's change, m^d, due to u: change of content and, with `slopes`, of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -346,8 +348,10 @@ class StorageProblem:
 
     Parameters
     ----------
-    forms, system
-        Compiled forms; vectors and matrices, with the assembled fluxes.
+    forms
+        Compiled forms.
+    system
+        Vectors and matrices, with the assembled fluxes.
     data
         Quadrature points of the pieces.
     contents
@@ -409,7 +413,9 @@ class StorageProblem:
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._correction = self._begin(outflow)
-        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent leaves it out."""
+        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent omits this
+        correction.
+        """
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -477,7 +483,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content by pressure errors (n,), Pa, and changes of the content in the step."""
+        """Return errors of the water content due to pressure errors (n,), Pa, and the content's changes in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -615,7 +621,7 @@ class StorageProblem:
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for its pieces or for `data`.
+        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for the problem's pieces or `data`.
 
         `of_suction` are cells (c,) and derivatives of their nodal forces (c, n) by p, m^(d-1), if a law depends on
         suction.
@@ -651,9 +657,10 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  B K^-1 B^T is beta V for a smooth
-            pressure, and zero for a checkerboard.  For a pressure that alternates along one axis, it is beta V / 2 (at
-            nu = 0). beta V - L has the same values, with L = sum over faces of min(beta V+, beta V-) / (4 d) [p][q].
+            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  With the stiffness K, B K^-1 B^T
+            equals beta V for a smooth pressure, and zero for a checkerboard.  It equals beta V / 2 (at nu = 0) for a
+            pressure that alternates along one axis.  beta V - L equals the same values, with L = sum over faces of
+            min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

@@ -49,9 +49,9 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
     k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k; y is x drop / (jump
-    of the pressure).  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).  It is exact for
-    steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.  Without gravity
-    it is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
+    of the pressure).  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).  The result is exact
+    for steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.  Without
+    gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
 
     Parameters
     ----------
@@ -186,10 +186,10 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) along normals (m, d), between pressures p of owned cells and outside pressures (m,), Pa.
+        """Return k_r between cells and sides, and the derivative of k_r (p - outer + drop) by p, both (m,).
 
-        Also return the derivative by p of k_r times the potential difference.  `drop` (m,), Pa, is the pressure drop
-        from the centroid to the face caused by the weight of the fluid.
+        Pressures (m,), Pa: p in owned cells, `outer` outside, and `drop`, the drop from the centroid to the face that
+        the weight of the fluid causes.  `normal` (m, d): normals of the sides.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

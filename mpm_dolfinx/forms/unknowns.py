@@ -21,14 +21,9 @@ from mpm_dolfinx.base import _compat
 class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
-    Parameters
-    ----------
-    function
-        Any function of the space; its ghosts are used.
-    dofs
-        Unrolled local degrees of freedom that are unknowns, ghosts included.
-    x : (entities, d), m
-        Positions of the nodes or cells of this process.  With None, the space computes all positions at each request.
+    function: any function of the space; its ghosts are used.  dofs: unrolled local degrees of freedom that are
+    unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  With None, the
+    space computes all positions at each request.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):

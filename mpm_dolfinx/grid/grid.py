@@ -131,14 +131,20 @@ class Cells:
 
     num_owned, num_local
         Number of cells without and with ghosts.
-    cell_nodes, signs
-        Nodes of each cell (cells, 2^d), as numbered in Q1 functions; directions from midpoint to nodes (2^d, d).
+    cell_nodes : (cells, 2^d)
+        Nodes of each cell, as numbered in Q1 functions.
+    signs : (2^d, d)
+        Directions from the midpoint of a cell to its nodes.
     at
         Current positions.
-    cell_number, locals, owners
-        Lexicographic index of each local cell; for all cells, copy by copy: local index, or -1, and owner rank.
-    cell_facets, facet_cells
-        Facets of each cell (cells, 2d); cells at each facet (facets, 2), -1 outside the boundary.
+    cell_number
+        Lexicographic index of each local cell.
+    locals, owners
+        Local index, or -1, and owner rank of all cells of the grid, copy by copy.
+    cell_facets : (cells, 2d)
+        Facets of each cell.
+    facet_cells : (facets, 2)
+        Cells at each facet, -1 outside the boundary.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -187,7 +193,7 @@ class Cells:
         return out
 
     def move(self, grid: Grid) -> None:
-        """Move mesh, nodes and cells to the current lines of the grid.  Their positions depend on nothing else."""
+        """Move mesh, nodes and cells to the current lines of the grid; positions depend only on these lines."""
         if grid.follow is None:
             return
         node_x, x = map(grid.places, self._index)
@@ -231,9 +237,9 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the tool, and the cells around them widen or narrow.  A function of time t (s), of the positions x (n, d) of all
-        points, or of both returns the same number of lines between the same sides.  A tool must be a condition of the
-        first stage; lines do not move in stages without the tool.
+        the tool, and the cells around them widen or narrow.  The tool must be a condition of the first stage; lines do
+        not move in stages without it.  A function depends on time t (s), the positions x (n, d) of all points, or both.
+        It returns all lines: as many along each axis as `lines`, with the same first and last coordinate.
     axisymmetric
         Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
         forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
@@ -247,18 +253,29 @@ class Grid:
 
     Attributes
     ----------
-    dim, shape, lower, upper
-        Dimension d; number of cells along each axis (d,); corners (d,), m.
-    even, lines, widths
-        Whether all cells are equal; current lines (n,) along each axis, relative to `base`, m; edge lengths (n - 1,)
-        along each axis, m.
-    finest, least, most
-        Shortest edge along each axis (d,), m; shortest and longest edge of all cells, m.
+    dim
+        Dimension d.
+    shape : (d,)
+        Number of cells along each axis.
+    lower, upper : (d,), m
+        Corners of the grid.
+    even
+        Whether all cells are equal.
+    lines : (n,) along each axis, m
+        Current lines, relative to `base`.
+    widths : (n - 1,) along each axis, m
+        Current edge lengths of the cells.
+    finest : (d,), m
+        Shortest edge along each axis.
+    least, most : m
+        Shortest and longest edge of all cells.
     snap
         (Distance to a grid plane) / (cell size) along each axis (d,), below which a vertex lies on the plane.
-    base, low, high
-        Origin (d,), m, of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin
-        preserves digits of positions far from the true origin.  Lower and upper corner relative to `base`.
+    base : (d,), m
+        Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
+        digits of positions far from the true origin.
+    low, high : (d,), m
+        Lower and upper corner relative to `base`.
     stretches
         Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
     mesh
@@ -467,12 +484,8 @@ class Grid:
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
 
-        Parameters
-        ----------
-        load : (cells,)
-            Load of each cell, such as its number of points, >= 0.
-        keep
-            Whether to keep an existing mesh for any distribution, because other objects were created on this mesh.
+        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
+        any distribution, because other objects were created on this mesh.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -690,12 +703,8 @@ class GridOfGroups(Grid):
     The mesh consists of disconnected boxes at the same position.  The same process owns corresponding cells of all
     copies.
 
-    Parameters
-    ----------
-    grid
-        Grid of the bodies.
-    group : (points,)
-        Group of each material point of the scene, in the order of ids, counted from 0.
+    grid: grid of the bodies; group (points,): group of each material point of the scene, in the order of ids, counted
+    from 0.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):

@@ -18,12 +18,8 @@ EMPTY = 1e-2
 def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
     """Return the owner rank of each cell, as an array with the shape of the grid.
 
-    Parameters
-    ----------
-    load : (cells along each axis)
-        Load of each cell, such as its number of points, >= 0.
-    processes
-        Number of ranks, >= 1.
+    load (cells along each axis): load of each cell, such as its number of points, >= 0; processes: number of ranks, >=
+    1.
     """
     filled = load > 0
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
@@ -68,12 +64,7 @@ def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[ND
 
     Processes that own a neighbour across a face hold the cell as a ghost.
 
-    Parameters
-    ----------
-    owner
-        Owner rank of each cell, with the shape of the grid.
-    cells : (n,)
-        Lexicographic indices of the cells.
+    owner: owner rank of each cell, with the shape of the grid; cells (n,): lexicographic indices of the cells.
     """
     index, shape = np.array(np.unravel_index(cells, owner.shape)), np.array(owner.shape)[:, None]
     ranks = [owner.ravel()[cells]]

@@ -240,14 +240,8 @@ def _row(result: Result) -> dict[str, float]:
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
     """Return the particle domains as unconnected cells, with all fields of the material points.
 
-    Parameters
-    ----------
-    points
-        All material points.
-    displacement : (n, d), m
-        Displacements of the points.
-    wet
-        Whether the points have a pore pressure.
+    points: all material points; displacement (n, d), m: displacements of the points; wet: whether the points have a
+    pore pressure.
     """
     fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
     if wet:

@@ -7,15 +7,17 @@ elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(ta
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
-and flow is associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  The stress at the end of a
-step follows implicitly from the trial stresses P_t and Q_t.  The plastic compaction is kappa a.  The plastic multiplier
-dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
+and flow is associated.  M is the slope of the critical state line, and P_c the size of the yield surface.  P_0 is the
+pressure at F = I, and e_v^p the plastic volume strain.  P and P_c follow the bilogarithmic law: ln v (v: specific
+volume) is linear in ln P, with the slope lambda in first loading, kappa in unloading.  The stress at the end of a step
+follows implicitly from the trial stresses P_t and Q_t, and from P_c,n at the start.  The plastic compaction is kappa a.
+The plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a).  It gives the stress ratio at the end, Q / (M P) = sqrt(w) exp(-d/2).  On the yield
-surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
+The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d, Q / (M P) = sqrt(w) exp(-d/2).  On the
+yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
 isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the
@@ -88,8 +90,8 @@ class ModifiedCamClay(Skeleton):
     bulk
         Must not be given: the bulk modulus at the start is P_0 / kappa.
 
-    Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `consolidated`,
-    ln(P_c / initial P_c), in `points.data`.  Source: Borja and Tamagnini (1998).
+    Other parameters: see `Skeleton`, all by name.  State variables in `points.data`: `plastic`, the inverse plastic
+    metric C_p^-1 (3, 3), and `consolidated`, ln(P_c / initial P_c).  Source: Borja and Tamagnini (1998).
 
     Raises
     ------
@@ -259,9 +261,9 @@ class BarcelonaBasic(ModifiedCamClay):
     reference
         Stress P_r, Pa, > 0; if P_c0 < P_r, P_c does not depend on suction.  Usually 0.01 to 0.5 times the initial P_c0.
 
-    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  The state is that of Modified
-    Cam Clay, with ln(P_c0 / initial P_c0) as `consolidated`, `suction` and `suction_at_start`, Pa.  Source: Alonso,
-    Gens and Josa (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables: `plastic`,
+    `consolidated` = ln(P_c0 / initial P_c0), `suction` and `suction_at_start`, Pa.  Source: Alonso, Gens and Josa
+    (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------

@@ -8,7 +8,8 @@ The return to the yield surface
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
 has the closed form of small strain, on the cone or at its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).
-The consistent tangent is UFL's derivative of the stress.
+`MATCHES` gives eta and xi; kappa is the accumulated plastic strain.  The consistent tangent is UFL's derivative of the
+stress.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ class DruckerPrager(Frictional):
         for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In axisymmetry
         no cone coincides everywhere: a circular footing on von Mises's soil bears 10 % less than on Tresca's.
 
-    Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and `hardened`, kappa, in
-    `points.data`.  Source: de Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
+    Other parameters: see `Skeleton`, all by name.  State variables in `points.data`: `plastic`, the inverse plastic
+    metric C_p^-1 (3, 3), and `hardened`, kappa.  Source: de Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
 
     Raises
     ------

@@ -220,17 +220,14 @@ class SoftnessAtPoints:
     volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.
     tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
-    The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress tau at F - (1 - s) dF, the tangent shear
-    modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from
-    the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
+    The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
+    modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
+    current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
     At rest the strain is rounding, and its direction is random.  G_t is therefore a weighted mean: the modulus of the
     step has the weight e : e, the modulus before the step the weight `NEAR`^4.  A step at rest thus changes nothing.
 
-    Parameters
-    ----------
-    grid, law, shapes, stretches
-        See `LawAtPoints`.
+    grid, law, shapes, stretches: see `LawAtPoints`.
     """
 
     def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], stretches: int):

@@ -39,8 +39,9 @@ changes the result of scene "soil" in tests/plateaus.py by 6.6e-05 (relative), d
 by 3.0e-02.
 """
 STIFFEST = 100.0
-"""Upper limit of (alpha^2 / S) / (lambda + 2G), which limits rounding errors.  Halving this value changes the result of
-scene "soil" in tests/plateaus.py by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
+"""Upper limit of (alpha^2 / S) / (lambda + 2G), the stiffness of the pore fluid relative to the skeleton's (S: storage
+coefficient), which limits rounding errors.  Halving this value changes the result of scene "soil" in tests/plateaus.py
+by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
 """
 
 
@@ -416,16 +417,16 @@ class SceneMaterials:
         empty = 1 - self.saturation(points, points.pressure)[0]
         return density - empty * self.porosity(points) * self.fluid.density
 
-    def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def confined_modulus(self, points: MaterialPoints, most: float = STIFFEST) -> NDArray[np.float64]:
         """Return the undrained confined modulus (n,), Pa: lambda + 2G + alpha^2 / S.
 
-        alpha^2 / S is limited to `STIFFEST` (lambda + 2G).
+        alpha^2 / S is limited to `most` (lambda + 2G).
         """
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
             return modulus
         fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), TINY)
-        return modulus + np.minimum(fluid, STIFFEST * modulus)
+        return modulus + np.minimum(fluid, most * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the state at the points (n, ...)."""

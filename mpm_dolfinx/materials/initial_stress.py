@@ -127,14 +127,7 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 class InitialStresses:
     """Initial stresses of the bodies of a scene.
 
-    Parameters
-    ----------
-    bodies
-        All bodies.
-    given
-        See `by_body`.
-    pressure
-        Initial pore pressure, Pa, a number or a function of position.
+    bodies: all bodies; given: see `by_body`; pressure: initial pore pressure, Pa, a number or a function of position.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):

@@ -8,8 +8,9 @@ to round-off.  The forms contain
 
 which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress by F, also
 through y, is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.
-If the stress is not differentiated, y* alone is used.  If the law has an energy, its stress is already a derivative.
-Then y has a second-order term, whose coefficients also follow from f = 0.  A law in numpy returns y(z) and dy/dz.
+If the stress is not differentiated, y* alone is used.  If the law has an energy, the tangent is its second derivative.
+The expression for y then has a second-order term, whose coefficients also follow from f = 0.  A law in numpy returns
+y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class LocalUnknowns:
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
         The unknowns and `trial`, for expressions that are not differentiated with respect to F: kernels then skip the
-        trial values.  For laws with an energy it equals `values`.
+        trial values.  For laws with an energy `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):

@@ -6,11 +6,12 @@ stresses t_1 >= t_2 >= t_3, tension positive,
 
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
-flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along e_i.  The return mapping keeps the order
-of the principal values.  It therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric
-and Owen 2008, 8.2, without the cut-off).  On each of them the final stress is linear in the trial stress.  A final
-stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the
-least violation is used; its violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
+flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along e_i.  e_i are principal directions; phi,
+psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the principal values.  The return
+therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric and Owen 2008, 8.2, without
+the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
+admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the least violation is used;
+its violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class MohrCoulomb(Frictional):
     tension
         Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default that of the apex, c cot phi.
 
-    Other parameters: see `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
+    Other parameters: see `Skeleton`, all by name.  State variable in `points.data`: `plastic`, the inverse plastic
+    metric C_p^-1 (3, 3).
 
     Raises
     ------
@@ -189,7 +191,7 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the final stresses of least violation (n, 3), Pa, derivatives (n, 3, 3) and violations (n,)."""
+        """Return the valid final stresses (n, 3), Pa, their derivatives (n, 3, 3), and their violations (n,)."""
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:

@@ -225,12 +225,7 @@ class Skeleton:
     def first_piola(cls, F, values: Mapping[str, object]):
         """Return the first Piola-Kirchhoff effective stress (d, d), Pa, as UFL.
 
-        Parameters
-        ----------
-        F
-            Deformation gradient (d, d), a UFL variable.
-        values
-            UFL values of the parameters and of the state.
+        F: deformation gradient (d, d), a UFL variable; values: UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is None:
             return ufl.diff(expression(cls.energy, [()], "F", F=F, **values), F)
@@ -252,12 +247,7 @@ class Skeleton:
     def out_of_plane(cls, F, values: Mapping[str, object]):
         """Return the out-of-plane effective Cauchy stress in plane strain, Pa, as UFL; None if the law has none.
 
-        Parameters
-        ----------
-        F
-            Deformation gradient (2, 2), a UFL variable.
-        values
-            UFL values of the parameters and of the state.
+        F: deformation gradient (2, 2), a UFL variable; values: UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is not None:
             tau = cls._kirchhoff(F, values, (2, 2))
@@ -337,8 +327,8 @@ class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
     Plane strain in 2D.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
-    eigenvalues of C = F^T F finite.  Only the deviatoric part contains it, with zero derivative at F = I.  The stress
-    at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
+    eigenvalues of C = F^T F finite.  Only the deviatoric part contains this constant, with zero derivative at F = I.
+    The stress at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
     """
 
     @staticmethod
@@ -366,8 +356,8 @@ def _deviatoric(F):
 def _stretch_difference(C):
     """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
-    The eigenvalues divided by their mean are 1 + radius and 1 - radius.  This formula has one quotient; second
-    derivatives of C / mean would have twice as many.
+    The eigenvalues divided by their mean are 1 + radius and 1 - radius.  The formula has one quotient, `ratio`.  If C
+    were divided by its mean first, the second derivatives would contain twice as many quotients.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
@@ -451,7 +441,7 @@ class unsaturated:
     Parameters
     ----------
     suction
-        Suction, Pa, > 0: 0.5 to 1 times the unit weight of water times the cell height.
+        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times (unit weight of water) (cell height).
     least
         Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
     specific_yield

@@ -42,8 +42,9 @@ class SofteningDruckerPrager(DruckerPrager):
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
-    Other parameters: see `DruckerPrager`, without hardening.  The state is `plastic` and `hardened`, xi times the
-    plastic shear strain.  Soil in tension at the apex of the cone has the residual cohesion.
+    Other parameters: see `DruckerPrager`, without hardening.  State variables: `plastic`, the inverse plastic metric
+    C_p^-1 (3, 3), and `hardened`, xi gamma, with the coefficient xi of the cohesion in the yield function and the
+    plastic shear strain gamma.  Soil in tension at the apex of the cone has the residual cohesion.
 
     Raises
     ------

@@ -49,14 +49,8 @@ class Isotropic:
 class Trial:
     """Trial elastic strain for a deformation gradient, in UFL.
 
-    Parameters
-    ----------
-    F
-        Deformation gradient (d, d).
-    plastic
-        C_p^-1 (3, 3).
-    prestretch
-        Principal elastic stretches (3,) at F = I, or None.
+    F: deformation gradient (d, d); plastic: C_p^-1 (3, 3); prestretch: principal elastic stretches (3,) at F = I, or
+    None.
     """
 
     def __init__(self, F, plastic, prestretch=None):
@@ -107,14 +101,8 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class Coaxial:
     """Tensors coaxial with given tensors.
 
-    Parameters
-    ----------
-    x, axes : (n, 3), (n, 3, 3)
-        Eigenvalues and axes of the given tensors, see `eigen`.
-    y : (n, 3)
-        Principal values of the coaxial tensors.
-    plane
-        Whether tensors have the components in `PLANE`, for plane strain and axisymmetry.
+    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`; y (n, 3): principal values of the
+    coaxial tensors; plane: whether tensors have the components in `PLANE`, for plane strain and axisymmetry.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):

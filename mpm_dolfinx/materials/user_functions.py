@@ -9,8 +9,8 @@ points
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v; the gradient is (3, 3) in
     axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u,
     with the volume ratio as determinant.  `points.position` and `points.displacement` are values at the start of the
-    step; displacements count from the start of the run or the last reset.  Other names: fields of materials that are
-    functions of position, and the laws' state.
+    step; displacements count from the start of the run, or since a stage set them to zero.  Other names: fields of
+    materials that are functions of position, and the laws' state.
 t
     Time at which the balances hold, s, a UFL constant: the end of the step or of its first substep.
 

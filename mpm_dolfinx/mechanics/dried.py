@@ -22,15 +22,10 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
     """Return the sums of the pieces of one part for `OfSuction`; None if there are none.
 
-    Parameters
-    ----------
-    points, locks
-        Integration points of the pieces; whether their law uses the mean dilatation.
-    F
-        Deformation gradient (d, d), a UFL variable.
-    slopes
-        UFL derivatives with respect to the pressure, Pa: of the first Piola-Kirchhoff stress (d, d) and, with mean
-        dilatation, of the stress pi conjugate to theta.  Empty if the law is independent of suction.
+    points: integration points of the pieces; locks: whether their law uses the mean dilatation; F: deformation gradient
+    (d, d), a UFL variable; slopes: UFL derivatives with respect to the pressure, Pa: of the first Piola-Kirchhoff
+    stress (d, d) and, with mean dilatation, of the stress pi conjugate to theta.  Empty if the law is independent of
+    suction.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -42,14 +37,8 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of the nodal forces with respect to the cells' pressures, for laws that depend on suction.
 
-    Parameters
-    ----------
-    dim
-        Number of axes.
-    dilatation
-        Mean dilatation of cells, None if no cell would lock.
-    sums
-        For each part, see `SceneMaterials.parts`, the result of `suction_sums`.
+    dim: number of axes; dilatation: mean dilatation of cells, None if no cell would lock; sums: for each part, see
+    `SceneMaterials.parts`, the result of `suction_sums`.
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):

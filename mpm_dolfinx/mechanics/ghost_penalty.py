@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
-The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment of the step. Nearly empty cells then
-affect neither the conditioning nor the accuracy. The penalty resists each step's increment like a viscosity, so it must
-not act on load-bearing cells:
+The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment u of the step. gamma is `GHOST`, and s
+is the strength of a face (see below). G is the shear modulus, h the cell size, and [d_n u] the jump of the normal
+derivative.  Nearly empty cells then affect neither the conditioning nor the accuracy. The penalty resists each step's
+increment like a viscosity, so it must not act on load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 as (filling of the emptier cell) / (filling of the fuller cell) rises from
   0 to RATIO. A second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier one).

@@ -2,7 +2,7 @@
 """Prescribed displacements of sides, by penalties on the mean in each cell and weaker ones at points; see `held_cells`.
 
 If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
-multipliers (Hestenes 1969).  With multipliers the means are exact against any resistance of the body.
+multipliers (Hestenes 1969).  With multipliers the means are exact, whatever the resistance of the body.
 """
 
 from __future__ import annotations
@@ -157,9 +157,10 @@ class GivenDisplacements(Acting):
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
         modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
-        firm = self._materials.confined_modulus(before)
         # values at the last reset of the grid, like the stiffnesses: constant until the next reset
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
+        confined = [self._materials.confined_modulus(before, *most) for most in ((), (1 / EPSILON,))]
+        moduli = np.stack([modulus, tension, resists, *confined], axis=1)
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
@@ -169,19 +170,18 @@ class GivenDisplacements(Acting):
             given = np.concatenate(given[1:], axis=1)
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
-            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
-            each = np.stack([np.full(len(gap), number), *own], axis=1)
-            values = np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)
+            own = p.area0[:, None] * moduli[at]
+            values = np.column_stack([np.full(len(gap), number), p.area0, own, gap, given, p.area(cut.points), force])
             rows.append((p.cell, p.x, values))
             bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
-        cell, x, values = self._grid.gathered(rows, 6 + 5 * d)
+        cell, x, values = self._grid.gathered(rows, 7 + 5 * d)
         extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
         sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
         inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
         if over_all(self._grid.comm, int((inner != cell).any())):
-            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 6 + 5 * d)
-        number, *own = values[:, :6].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
+            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 7 + 5 * d)
+        number, *own = values[:, :7].T
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 7:], [d, 3 * d, 4 * d], axis=1))
 
     def _check_meeting(self, t: float) -> None:
         """Raise ValueError if prescribed displacements differ where two sides meet: the stress would be infinite."""
@@ -205,7 +205,8 @@ class GivenDisplacements(Acting):
         data = loads.data
         force = loads.pull(at.nodal)
         told = {number for number, what in self._warned if what == ARTEFACT}
-        for number, x in held.beyond(loads.row, data["direction"].argmax(axis=1), force, told):
+        axis = data["direction"].argmax(axis=1)
+        for number, x in held.beyond(loads.row, axis, force, loads.reached(at), told):
             why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
             self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
@@ -213,7 +214,7 @@ class GivenDisplacements(Acting):
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
-        """Warn, once for each condition, of what is wrong with the condition with this index."""
+        """Warn, once for each condition, of a fault of the condition with this index."""
         if (number, what) not in self._warned:
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
             self._warned.add((number, what))
@@ -305,7 +306,7 @@ class HoldLoads(Loads):
         """
         if not self._place.dt:
             return False
-        means, axis = self.row < len(self.held.limit), self.data["direction"].argmax(axis=1)
+        means, axis = self.row < self.held.limit.shape[1], self.data["direction"].argmax(axis=1)
         side = self._d * self.held.number[self.row] + axis
         weight = np.where(means, self.data["stiffness"][:, 0], 0.0)
         gap = np.where(means, self._asked - self._along(at.nodal), 0.0)
@@ -317,6 +318,10 @@ class HoldLoads(Loads):
         self._lacked = np.where(more, lacks, self._lacked)
         self.data = self.data.having(gap=self.data["gap"][:, 0] + gap * more[side])
         return bool(more.any())
+
+    def reached(self, at: At) -> NDArray[np.bool_]:
+        """Return which components (m,) have reached their positions at u: they lag by less than 1 / sqrt(HOLD)."""
+        return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:
         """Add the forces towards the prescribed displacements."""
@@ -347,7 +352,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return unrolled dofs (n,), and penalty forces (n,), N, on them that do not count as reactions of walls."""
+        """See `Loads`: penalty forces on walls."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

@@ -16,7 +16,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.conditions.conditions import HOLD
 from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import RATIO
@@ -51,7 +51,8 @@ class HeldPoints(NamedTuple):
     modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; this and the next three: at the last grid reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
-    firm: NDArray[np.float64]  # (n,) confined modulus times area, N
+    firm: NDArray[np.float64]  # (n,) confined modulus times area, N, of which the part of the fluid is limited
+    undrained: NDArray[np.float64]  # (n,) undrained confined modulus times area, N
     x: NDArray[np.float64]  # (n, d) position, m
     gap: NDArray[np.float64]  # (n, d) prescribed minus present position, m
     given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
@@ -69,9 +70,10 @@ def inner_cells(
 ) -> NDArray[np.int64]:
     """Return the local cells (n,) whose constraints contain the points of sides.
 
-    A flat side on a grid line is slightly wavy, so some of its cells are nearly empty.  Their constraints would
-    contradict those of inner cells: only a large motion of nodes beyond the line, which nothing resists, could satisfy
-    both.  The inner cell therefore takes these points too (aggregation; Badia, Verdugo and Martin 2018).
+    After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
+    beyond the line.  Constraints there would contradict the constraints of inner cells: only a large motion of nodes
+    beyond the line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain
+    these points too (aggregation; Badia, Verdugo and Martin 2018).
 
     fill (cells,): volume fraction; sides: for each condition its prescribed components, and the extent (d,), m, of its
     prescribed positions.  For each point: index of its condition, `number` (n,); its owned `cell` (n,); its outward
@@ -92,7 +94,7 @@ def inner_cells(
 
 
 class HeldCells:
-    """Penalties of prescribed displacements: those on means, one for each condition and cell, then those at points.
+    """Penalties of prescribed displacements: first on means, one for each condition and cell, then at points.
 
     Parameters
     ----------
@@ -103,13 +105,16 @@ class HeldCells:
 
     Attributes
     ----------
-    number, cell, x, shape, moments
-        For each penalty: index of the condition; cell; position, m; shape functions; products of offsets from the
-        cell's midpoint, m^2 and m^3.  For a penalty on a mean, the last three are means over its points.
+    number, cell
+        Index of the condition, and cell, of each penalty.
+    x, shape, moments
+        Position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3, of each penalty.
+        For a penalty on a mean, the values are means over its points.
     stiffness
         Stiffness of each penalty and component, N/m.  Normal to a side parallel to the grid: from the confined modulus.
-    limit
-        Largest plausible force of each penalty on a mean, N; larger forces are artefacts.
+    limit : (2, k, d)
+        Largest plausible force of each penalty on a mean, N: of the skeleton, and of undrained soil at its prescribed
+        position.  Larger forces are artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -154,7 +159,10 @@ class HeldCells:
         self.stiffness = both(HOLD / h[0] * modulus, each / h[1])
         # at the end of a side, a small area in a cell may bear the whole force of a node
         short = np.maximum(1.0, grid.smallest_faces(cell) * grid.around(x) / whole)
-        self.limit = CARRIED * total(p.resistance + TENSE * p.tension) * short
+        outward = normal**2 / np.maximum((normal**2).sum(axis=1, keepdims=True), TINY)
+        skeleton = total(p.resistance + TENSE * p.tension)[:, None]
+        more = outward * np.maximum(total(p.undrained) - total(p.resistance), 0.0)[:, None]
+        self.limit = CARRIED * short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
         self._given, self._rise = both(given, given[at]), both(rise, rise[at])
@@ -169,12 +177,11 @@ class HeldCells:
         extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
         the displacement must vary over the cell. The penalty is then omitted if others hold a free node of the cell.
 
-        axis: the component; given (conditions,): conditions that prescribe it; free (nodes,): nodes that no wall fixes.
+        given (conditions,), free (nodes,): conditions that prescribe the component `axis`, nodes that no wall fixes.
 
-        Returns
-        -------
-        Indices of the penalties (k,); their stiffness (k,), N/m; gaps (k,), m.  Fractions (k, 2^d) of the force on each
-        node, without the wall's part.  Index of a penalty that must move but has fixed nodes only, or -1.
+        Return indices of the penalties (k,), their stiffness (k,), N/m, gaps (k,), m, and fractions (k, 2^d) of the
+        force on each node, without the wall's part.  Also return the index of a penalty that must move but has fixed
+        nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -217,7 +224,7 @@ class HeldCells:
         return at_wall & (among(key, asked[found]) & some & ~stuck).any(axis=1)
 
     def beyond(
-        self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]
+        self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """Return conditions with forces beyond their limits: index of each, and position (d,), m, of its worst force.
 
@@ -225,13 +232,15 @@ class HeldCells:
         penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
         counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
 
-        row, axis, force (k,): penalty (its index), component (its axis), and force, N; told: indices of conditions that
-        have been reported already, which are excluded.
+        row, axis, force, reached (k,): index of the penalty, its axis, force, N, and whether it is at its position;
+        told: indices of conditions that have been reported already, which are excluded.
         """
         grid = self.grid
         comm = grid.comm
-        row, axis, force = (values[~np.isin(self.number[row], list(told))] for values in (row, axis, force))
-        limit = np.append(self.limit, np.zeros(len(self.number) - len(self.limit)))[row]
+        untold = ~np.isin(self.number[row], list(told))
+        row, axis, force, reached = (values[untold] for values in (row, axis, force, reached))
+        limit = np.concatenate([self.limit, np.zeros((2, len(self.number) - self.limit.shape[1], grid.dim))], axis=1)
+        limit = limit[reached.astype(int), row, axis]
         far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])
         suspected = sorted({int(k) for numbers in comm.allgather(far) for k in numbers})
         if not suspected:

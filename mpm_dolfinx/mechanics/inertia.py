@@ -5,19 +5,24 @@ A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. Th
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`).  Only velocities
-are carried from step to step.  In each step SDIRK2 dissipates a fraction GAMMA^4 (omega dt)^4, or 0.0074 (omega dt)^4,
-of an oscillation's energy.  This dissipation damps modes that the step cannot resolve.
+The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`).  u and the
+motion u^ without forces are displacements since the start of the step, and v_n is the velocity at this start.  v_1 and
+a_1 are velocity and acceleration of the previous substep.  Only velocities are carried from step to step.  In each step
+SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an oscillation of angular
+frequency omega.  This dissipation damps modes that the step cannot resolve.
 
-The mass is integrated over the pieces of the particle domains, with second moments S about their centroids x_k,
+The mass is integrated over the pieces of the particle domains, with masses m_k and second moments S_k about their
+centroids x_k,
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-with the ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full. For an affine field G
-v_n vanishes, and M v_n is the right side. The transfer to the grid and back therefore conserves linear and angular
-momentum to rounding. A material point carries v and F', the rate of F; the velocity in its domain is v + F' F^-1 (x -
-x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and
-Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects this rule's error for rotations.
+with the shape functions N and the velocity gradient L. The ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS acts on
+faces of cells that are not full. Here c is `GHOST_MASS`, h the cell size, and [[d_n N]] the jump of the normal
+derivative. For an affine field G v_n vanishes, and M v_n is the right side. The transfer to the grid and back therefore
+conserves linear and angular momentum to rounding. A material point carries v and F', the rate of F; the velocity in its
+domain is v + F' F^-1 (x - x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass:
+Burgess, Sulsky and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects this rule's error
+for rotations.
 """
 
 from __future__ import annotations
@@ -152,10 +157,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
     A rigid rotation then causes no strain in any body. P F^T is symmetric, so moments balance.
 
-    Parameters
-    ----------
-    G : (n, d, d)
-        Gradient of the displacement since the start of the step.
+    G (n, d, d): gradient of the displacement since the start of the step.
     """
     one = np.eye(G.shape[1])
     delta = one + G
@@ -166,14 +168,8 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
 
-    Parameters
-    ----------
-    points
-        All integration points.
-    of_laws
-        The integration points of each law.
-    u
-        Displacement increment of the step, m.
+    points: all integration points; of_laws: the integration points of each law; u: displacement increment of the step,
+    m.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -310,14 +306,9 @@ class Mass:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data `VELOCITY` and `RATE`, velocities and rates of F, after a step.
 
-        Parameters
-        ----------
-        points
-            Material points at the start of the step.
-        velocities
-            Velocities of the unknowns at the start and the end of the step, m/s.
-        moved : (n,)
-            Largest displacement of a corner, in cell sizes, in the connected part of the point; 0 if its cut is kept.
+        points: material points at the start of the step; velocities: velocities of the unknowns at the start and the
+        end of the step, m/s; moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the
+        point; 0 if the point keeps its pieces.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -365,14 +356,8 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    Parameters
-    ----------
-    mass
-        Mass of the bodies on the grid.
-    flight
-        Inertial predictor: displacement without forces, from the velocities alone, m.
-    rate
-        1 / g^2, 1/s^2, with the weight g, s, of the substep's own rate.
+    mass: mass of the bodies on the grid; flight, m: inertial predictor, the displacement without forces; rate, 1/s^2: 1
+    / g^2, with the weight g, s, of the substep's own rate.
     """
 
     holding = True

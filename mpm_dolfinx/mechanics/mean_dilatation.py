@@ -6,16 +6,18 @@ Four volume constraints per cell suppress the bending modes of a Q1 quadrilatera
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a slice of the
-body. The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of several materials,
-only the materials that would lock use Fbar. The energy sum w psi(Fbar) / J_n has the derivative
+Here w is the volume of a piece, Delta = I + grad u the gradient of the step, F = Delta F_n, and J_n = det F_n. The
+scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a slice of the body.
+The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of several materials, only
+the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has
+the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives by
-theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the material
-point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store Fbar.
-The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
+At fixed theta and pi, the residual has the additional term with pi, and the residual's tangent is symmetric. The
+derivatives by theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in
+the material point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points
+store Fbar.  The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -49,14 +51,10 @@ class SumsOfPart(NamedTuple):
 
 
 class FBar:
-    """F-bar modification of laws, with the volume ratio theta of the step in each cell and its mean stress pi.
+    """F-bar modification of laws, with the volume ratio theta of the step and the conjugate mean stress pi of each
+    cell.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    symmetric
-        Whether the tangents of all laws are symmetric.
+    grid: background grid; symmetric: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -107,8 +105,9 @@ class FBar:
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  Its derivative with respect
-        to F (d, d, d, d), Pa, for the tangent.  Quantities to be summed in each cell, and sums, for `MeanDilatation`.
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  The derivative of this
+        stress with respect to F (d, d, d, d), Pa, for the tangent.  Further UFL integrands of the tangent (`Beside`),
+        to be summed over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self._stress(law, F, Fbar, known)
@@ -171,12 +170,8 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
-    Parameters
-    ----------
-    fbar
-        The fields theta and pi.
-    parts
-        Sums of the parts in which cells would lock, by index of the part, see `QuadratureData`.
+    fbar: the fields theta and pi; parts: sums of the parts in which cells would lock, by index of the part, see
+    `QuadratureData`.
     """
 
     def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):
@@ -262,12 +257,7 @@ def _dev(tau, F):
 class StressAtPoints:
     """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
 
-    Parameters
-    ----------
-    P, slope
-        UFL expressions at the points: (d, d) and scalar.
-    points
-        Integration points of the part.
+    P (d, d), slope: the stress and its derivative, as UFL; points: integration points of the part.
     """
 
     def __init__(self, P, slope, points: FormPoints):

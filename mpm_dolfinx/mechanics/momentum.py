@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Balance of momentum: Q1 displacements on the grid, integrated over the pieces of particle domains in cells.
 
-The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J = det F. The residual is the
-derivative of
+The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J_n = det F_n, J_Delta = det Delta. The
+residual is the derivative of
 
-    int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
+    int psi(F) / J_n - alpha p J_Delta dV_n  -  loads,
 
-that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions.  P' is the first
-Piola-Kirchhoff effective stress relative to the start of the step.  A law may define the stress instead of psi.
+that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions.  psi is the energy of the
+skeleton, alpha Biot's coefficient, and p the pore pressure. P' is the first Piola-Kirchhoff effective stress relative
+to the start of the step.  A law may define the stress instead of psi.
 """
 
 from __future__ import annotations
@@ -205,7 +206,7 @@ class MomentumForms:
 
     @cached_property
     def nodal(self) -> NDArray[np.float64]:
-        """u by nodes (nodes, d), m."""
+        """Displacement increment u as an array (nodes, d), m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
@@ -393,8 +394,10 @@ class MomentumProblem:
 
     Parameters
     ----------
-    forms, system
-        Compiled forms; vectors and matrices, with assembled penalties.
+    forms
+        Compiled forms.
+    system
+        Vectors and matrices, with assembled penalties.
     data
         Integration points.
     loads
@@ -458,7 +461,7 @@ class MomentumProblem:
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements (active dofs,), m, for Newton's method.
 
-        These are the guesses of loads, such as a rigid rotation, and the extrapolation of the last step.
+        Each of the loads may propose a guess, such as a rigid rotation.  One more extrapolates the last step's motion.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
@@ -533,11 +536,11 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two relative residuals of each connected part: without rounding errors, and with them.
+        """Return two relative residuals of each connected part; r: residuals, N; scales (parts,): force scales, N.
 
-        r: residuals, N; scales (parts,): force scales, N.  The first result excludes the rounding error at each node.
-        With `first` it includes this error, so that even a load below the error causes a solve.  The second result uses
-        scales of at least the rounding error divided by the tolerance.
+        For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
+        subtracted, so that even a load below this error causes a solve.  For the second, the force scale of a part is
+        at least (rounding error) / (tolerance).  A residual as small as the rounding error then counts as converged.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid plates, by a uniform traction and a penalty kappa/2 int |grad_t u_n|^2 dA on the slope of the side."""
+"""Rigid plates: a uniform traction, and a penalty on the slope of the side, see `RigidPlate`."""
 
 from __future__ import annotations
 

@@ -3,8 +3,9 @@
 
 The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. The virtual work of
 a pressure is -int p n . v da on the present area. The tangent of this term is symmetric except for a contribution p/2
-(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. It also
-vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
+(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. The
+contribution also vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the
+wall.
 """
 
 from __future__ import annotations
@@ -33,13 +34,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides of the bodies, in a stage.
-
-    Parameters
-    ----------
-    setting, loads
-        The stage, and its loads by name.
-    """
+    """Loads of one kind on sides of the bodies in a stage, `setting`; loads: by name."""
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms
@@ -182,12 +177,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
     A surface counts as open if corners of its faces lie on the edges of other faces.
 
-    Parameters
-    ----------
-    free : (nodes, d)
-        Which displacement components walls leave free.
-    pressures
-        Pressures and their faces.
+    free (nodes, d): which displacement components walls leave free; pressures: pressures and their faces.
     """
     if not pressures:
         return True

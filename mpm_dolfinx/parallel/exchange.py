@@ -35,12 +35,7 @@ traffic = Traffic()
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
-    Parameters
-    ----------
-    comm
-        Processes of the exchange.
-    destination : (n,)
-        Rank of the process that receives each row.
+    comm: processes of the exchange; destination (n,): rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
@@ -66,7 +61,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row; return the answers to this process, in the order it sent."""
+        """Send back one answer for each received row; return the answers to this process, in the order of its rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages whose frames a warning skips, because it names a line of the user's script."""
+"""Packages whose frames a warning skips, because warnings name a line of the user's script."""
 
 
 class ResultWarning(UserWarning):

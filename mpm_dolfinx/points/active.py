@@ -64,8 +64,10 @@ class Active:
         The active set; the same object while the cells are the same.
     slot : (cells,)
         Index of each cell among the owned active cells.
-    centroid, opening : (cells, d), (cells, d, 2)
-        Offset, m, of the material's centroid from the midpoint; open fractions of faces. Empty without fluid.
+    centroid : (cells, d), m
+        Offset of the material's centroid from the midpoint. Empty without fluid.
+    opening : (cells, d, 2)
+        Open fractions of faces. Empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):

@@ -5,9 +5,9 @@ A material point has a quadrilateral or hexahedral domain with tracked corners. 
 centroids, in 3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear.
 One quadrature point per piece therefore integrates these gradients exactly, wherever the domain lies on the grid.
 
-The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles match those of
-neighbouring domains, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives
-the volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
+The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
+domains match, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives the
+volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
 interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
 
 In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
@@ -85,7 +85,7 @@ def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): the m vertices by `vertices`."""
+    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): vertices, see `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
@@ -172,12 +172,8 @@ def _chunks(count: int, dim: int) -> list[slice]:
 def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
-    Parameters
-    ----------
-    corners : (n, 2^d, d), m
-        Corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
-    second, faces
-        Whether to compute second moments and face areas of the pieces.
+    corners (n, 2^d, d), m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`;
+    second, faces: whether to compute second moments and face areas of the pieces.
 
     Returns
     -------
@@ -198,10 +194,8 @@ def on_planes(
 
     Positions for slicing: in units of cells if all cells are equal, else in m, because domain edges are straight in m.
 
-    Parameters
-    ----------
-    true, x, axes
-        Positions from the grid's lower corner, in units of cells; the same from the base, m; array axis of components.
+    true: positions from the grid's lower corner, in units of cells; x, m: the same positions from the base; axes: array
+    axis of the components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -502,12 +496,8 @@ def cut_faces(
     A face across a grid line must load the nodes on both sides in proportion to its parts. With one point per face, the
     error would move nodes of partly filled cells in every step without limit.
 
-    Parameters
-    ----------
-    corners : (m, 2^(d-1), d), m
-        Corners of the faces; triangles repeat their last corner.
-    local : (m, 2^(d-1), e)
-        Coordinates of the corners, to be interpolated.
+    corners (m, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (m, 2^(d-1), e):
+    coordinates of the corners, to be interpolated.
 
     Returns
     -------

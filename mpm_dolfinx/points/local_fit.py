@@ -3,9 +3,10 @@
 
     sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i: offsets from the position.
 
-The value is the constant term of P (Lancaster and Salkauskas 1981). Polynomials up to the degree of P are exact. The
-weights decrease smoothly to zero, so values are continuous when data enter or leave the fit. The small terms set
-coefficients to zero that the data do not determine, the higher degrees first.
+P is a polynomial, v_i are the data, and w is a weight. The value is the constant term of P (Lancaster and Salkauskas
+1981). Polynomials up to the degree of P are exact. The weights decrease smoothly to zero, so values are continuous when
+data enter or leave the fit. The small terms set coefficients to zero that the data do not determine, the higher degrees
+first.
 """
 
 from __future__ import annotations

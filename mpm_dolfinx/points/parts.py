@@ -38,14 +38,7 @@ class Parts:
 class OfParts:
     """Entries of a distributed vector on this process, with the connected part of each entry.
 
-    Parameters
-    ----------
-    comm
-        The processes.
-    of : (n,)
-        Part of each entry.
-    count
-        Number of parts.
+    comm: the processes; of (n,): part of each entry; count: number of parts.
     """
 
     comm: MPI.Comm
@@ -81,16 +74,8 @@ def largest_of_bodies(
 ) -> NDArray[np.float64]:
     """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
 
-    Parameters
-    ----------
-    comm
-        The processes.
-    part : (m,)
-        Connected part of each value, from 0.
-    values : (k, m)
-        Values of this process.
-    inside : (bodies, parts)
-        Whether this process has points of the body in the part.
+    part (m,): connected part, from 0, of each column of the values (k, m); inside (bodies, parts): whether this process
+    has points of the body in the part.
     """
     largest = np.full((len(values), inside.shape[1]), -np.inf)
     for row, found in zip(values, largest, strict=True):

@@ -29,12 +29,8 @@ _HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 
 class Region:
     """The filled part of n cells that the surface crosses once, in cell coordinates from 0 to 1.
 
-    Parameters
-    ----------
-    cells
-        Local indices of the cells.
-    surface : (n, EDGES + 1, 2)
-        Vertices of the surface in each cell, from entry to exit, with the body on the left.
+    cells: local indices of the cells; surface (n, EDGES + 1, 2): vertices of the surface in each cell, from entry to
+    exit, with the body on the left.
     """
 
     def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):

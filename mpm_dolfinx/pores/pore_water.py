@@ -54,12 +54,8 @@ class PoreWater:
 
         Newton's method is applied to the logarithm of the suction, within a bracket.
 
-        Parameters
-        ----------
-        p : (n,), Pa
-            Initial values; they are returned if the cells then have the given contents.
-        offset : (m,), Pa
-            Pressures of the pieces minus pressures of their cells.
+        p (n,), Pa: initial values; they are returned if the cells then have the given contents. offset (m,), Pa:
+        pressures of the pieces minus pressures of their cells.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)

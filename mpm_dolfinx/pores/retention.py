@@ -6,7 +6,8 @@ the relative permeability k_r as functions of p,
 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
-(Richards 1931; Bishop 1959).  By default chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
+with the porosity n, the saturated conductivity k and Biot's coefficient alpha (Richards 1931; Bishop 1959).  By default
+chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
 
 A user-defined curve is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  It may have
 `bishop(p)`, which returns chi; by default chi = S.  Constants of laws derived from `Retention` are not compiled.
@@ -254,14 +255,8 @@ class Retentions:
     index is 0 if the pores stay saturated.  Pieces also have the field `lever`: the vector to the piece from the
     centroid of the material in its cell.  The piece's pressure is the cell's, plus the hydrostatic rise along `lever`.
 
-    Parameters
-    ----------
-    laws
-        Distinct retention curves of the scene's materials.
-    everywhere
-        Whether every material has a retention curve.
-    grid
-        Background grid.
+    laws: distinct retention curves of the scene's materials; everywhere: whether every material has a retention curve;
+    grid: background grid.
     """
 
     def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
@@ -358,10 +353,7 @@ def _called(law, name: str, p):
 class SaturationAt:
     """Saturation and its derivative, Bishop's coefficient and relative permeability at given pressures.
 
-    Parameters
-    ----------
-    grid, retentions
-        Background grid, and retention curves of the scene.
+    grid: background grid; retentions: retention curves of the scene.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -392,10 +384,7 @@ class Conductance:
 
     The integral is tabulated against the logarithm of the suction, and interpolated with cubic Hermite polynomials.
 
-    Parameters
-    ----------
-    grid, law
-        Background grid, and the retention curve.
+    grid: background grid; law: the retention curve.
     """
 
     def __init__(self, grid: Grid, law):
@@ -461,8 +450,8 @@ def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[n
 FARTHEST = np.log(10)
 """Largest change of the suction's logarithm in a Newton step; without a limit, fronts in dry soil do not converge.
 
-Celia's column of 25 and 100 cells takes 310 and 500 Newton steps in 28 time steps with a limit of 2.  With a limit of
-4 it takes 330 and 920, and four time steps are reduced.
+Celia's column of 25 and 100 cells takes 310 and 500 Newton steps in 28 time steps with a limit of 2.  With a limit of 4
+the column takes 330 and 920, and four time steps are reduced.
 
 Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
 and finer cells by 6.6e-03.
@@ -479,16 +468,11 @@ def restrained(
 
     A step across the characteristic suction ends there.  On each side of this suction the saturation is convex or
     concave, so Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at most
-    `FARTHEST`.  If the direction reverses, it changes by at most half of its previous change: no oscillations.
+    `FARTHEST`.  If the direction of the change reverses, the change is at most half of the previous change, so that the
+    logarithm does not oscillate.
 
-    Parameters
-    ----------
-    p, dp : (n,), Pa
-        Pressures, and their decreases by Newton's method.
-    scale : (n,), Pa
-        Characteristic suction.
-    previous : (n,)
-        Change of the pressure's `logarithm` in the previous Newton step.
+    p (n,), Pa: pressures; dp (n,), Pa: decreases of these by Newton's method; scale (n,), Pa: characteristic suction;
+    previous (n,): change of the pressure's `logarithm` in the previous Newton step.
     """
     new, limit = p - dp, -scale
     new = np.where((p - limit) * (new - limit) < 0, limit, new)

@@ -18,8 +18,8 @@ from mpm_dolfinx.stepping.state import State
 class CellFields:
     """Fields in the non-empty cells of this process; arrays for n cells.
 
-    The fields refer to the cells at the position of the grid for the next step.  They are second-order accurate at `x`,
-    not at the midpoint of the cell.  Means are volume averages over the material in the cell.
+    The fields refer to the cells at the position of the grid for the next step.  The fields are second-order accurate
+    at `x`, not at the midpoint of the cell.  Means are volume averages over the material in the cell.
 
     Attributes
     ----------
@@ -36,7 +36,8 @@ class CellFields:
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Volume that the pore fluid would have at zero pressure, minus the points' volume defect; None without fluid.
+        Pore fluid, as a volume at zero pressure: the content from porosity and pressure, minus its excess `owed` over
+        the true content (see `flow/storage.py`); None without fluid.
     """
 
     cell: NDArray[np.int64]

@@ -2,8 +2,8 @@
 """Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`LocalFit`).
 
 The fit uses cells that open faces connect to the probe's cell, at most three cells away along each axis.  Their soil
-must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the
-face pressure of the two-point flux.  On drained sides it uses the prescribed pressure.  Heads are fitted instead of
+must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the face
+pressure of the two-point flux.  On drained sides the fit uses the prescribed pressure.  Heads are fitted instead of
 pressures, so hydrostatic states are exact.  The heads of the probe's cell, of its neighbours and of the cell's drained
 sides bound the result.  Towards an undrained side the bound is extrapolated with the slope of the adjacent cells.
 """

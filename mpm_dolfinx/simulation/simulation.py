@@ -276,8 +276,8 @@ class Simulation:
             All conditions from now on; by default the present ones. `[*simulation.conditions, more]` adds one. Every
             `Contact` remains in force, whether it is listed or not.
         add
-            Indices of bodies in `later`: a fill, without velocity and stress. It is placed on the present surface of
-            the bodies that it touched when seeded; its opposite side remains at its seeded position.
+            Indices of bodies in `later`: a fill, without velocity and stress. A fill is placed on the present surface
+            of the bodies that it touched when seeded; the fill's opposite side remains where it was seeded.
         remove
             Indices of bodies to be removed: an excavation.
         reset_displacement

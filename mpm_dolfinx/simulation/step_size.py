@@ -48,7 +48,7 @@ AGAIN = 2.0
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
-"""Smallest `rtol` / solver tolerance; with a smaller `rtol` solver errors would hide the error of the step."""
+"""Smallest ratio of `rtol` to the solver tolerance; below it, solver errors would hide the error of the step."""
 FIRST = 1e-3
 """Smallest first adaptive step, relative to the first output interval."""
 
@@ -59,8 +59,10 @@ class StepSize:
 
     Parameters
     ----------
-    first, longest : s
-        First step; length of equal steps, or of the longest adaptive step.
+    first : s
+        First step.
+    longest : s
+        Length of equal steps, or of the longest adaptive step.
     rtol
         Tolerance of the pressure error, relative to the largest pressure change since the start of the run, or to the
         undrained pressure change of the step if that is larger; None for equal steps.
@@ -245,7 +247,7 @@ class Times:
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time for pressure diffusion through a cell, h^2 / c_v, s; 0 without conductivity."""
+    """Return the least (cell size)^2 / (coefficient of consolidation), s, of all points; 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)

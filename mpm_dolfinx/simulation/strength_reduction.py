@@ -53,11 +53,12 @@ A trial that slides starts with an overload of 0.9 times the missing strength in
 By the end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the smaller of its overload and the elastic strain at yield.
+"""Strain in a trial of a marginal slide, divided by the smaller of two values: overload of the trial, elastic strain at
+yield.
 
-Stresses of soil that begins to flow redistribute within a few strains at yield.  In soft soil such strains would change
-the shape of the body, so the viscosity is larger there.  If this number is halved or doubled, the factor of a slope
-changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
+Stresses of soil that begins to flow redistribute within strains of a few times that at yield.  In soft soil such large
+strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
+factor of a slope changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -97,7 +98,7 @@ def factor_of_safety(
     simulation
         Scene under its loads, which must be constant in time from now on.
     dt
-        Length of a step, s, > 0: long compared with viscous time scales of laws and terms. With flow of fluid it is
+        Length of a step, s, > 0: long compared with viscous time scales of laws and terms. With flow of fluid `dt` is
         required: short for undrained, long for drained failure.
     rtol
         Final relative difference of the bounds, in [1e-4, 0.5].

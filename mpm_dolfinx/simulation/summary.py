@@ -56,6 +56,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
             f"nu <= {LOCKING}, no plastic flow",
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
+        _either("kept volumes", s.motion.keeps_volumes, "of yielded domains", "not asked, or no plastic flow"),
         _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
         _either("inertia", state.stage.inertia, "of all bodies", "not asked" if m.inertia is None else "quasi-static"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),

@@ -34,8 +34,12 @@ class Tangent:
         Grid node and axis of each displacement.
     x : (n, d)
         Position of the node of each displacement, m.
-    pressure, content, storage : (n, m), (m, n), (m, m)
-        Blocks with pressures, without the derivative of fluxes with respect to displacements.
+    pressure : (n, m)
+        Derivative of forces with respect to pressures.
+    content : (m, n)
+        Derivative of fluid contents with respect to displacements, without that of the fluxes.
+    storage : (m, m)
+        Derivative of fluid contents with respect to pressures.
     cells : (m,)
         Cell of each pressure.
     """

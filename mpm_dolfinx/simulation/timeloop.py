@@ -80,8 +80,8 @@ def run(
     t_end
         End time, s, > t (not a duration).
     dt
-        Step and output interval, s, > 0; limited to t_end - t. With `rtol` it is only the output interval. With `rtol`,
-        and neither `dt` nor `t_eval`, every step is an output.
+        Step and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output interval. With
+        `rtol`, and neither `dt` nor `t_eval`, every step is an output.
     rtol
         Tolerance of adaptive steps. The estimated error of the pore pressures stays below about `rtol` times the
         larger of two changes: the largest since the start of the run, and the undrained change of the step. `rtol` is
@@ -282,7 +282,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including those of the earlier run that it continues."""
+    """Wall time and profile of a run, including the earlier run that this run continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall

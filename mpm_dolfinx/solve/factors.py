@@ -10,11 +10,12 @@ factors of displacements, which many solves use. Another holds the factors of pr
 Factorisation of both on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
-(`dissection`) takes 3.0 s and 4.6e7 entries; by PETSc's nested dissection 5.1 s and 5.0e7; by minimum degree 6 to 12 s
-and 7.5e7 (MUMPS 6.2 s and 5.3e7). With a tenth of the unknowns the orders take 80, 110, 120 ms; with fewer, the same.
+(`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s
+and 5.0e7, with minimum degree 6 to 12 s and 7.5e7, with MUMPS 6.2 s and 5.3e7. With a tenth of the unknowns these three
+orderings take 80, 110, 120 ms; with fewer unknowns, equal times.
 
-The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use it. With OpenBLAS MUMPS takes 1/2 to
-1/3 of the time.
+The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS MUMPS takes 1/2 to 1/3
+of the time.
 """
 
 from __future__ import annotations
@@ -46,12 +47,8 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve, and after changes of A; if `symmetric`, as L D L^T.
 
-    Parameters
-    ----------
-    gathered
-        Whether one process, the last one, holds the factors; this suits many solves with the same matrix.
-    package
-        Package of the factorisation; None: PETSc on one process, MUMPS on several.
+    gathered: whether one process, the last one, holds the factors; this suits many solves with the same matrix.
+    package: package of the factorisation; None: PETSc on one process, MUMPS on several.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -222,12 +219,8 @@ class SingleFactors:
 class NodalFactors:
     """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
-    Parameters
-    ----------
-    unknowns
-        Unknown displacements; components of a node are consecutive.
-    symmetric
-        Whether the factors are U^T D U; else L U.
+    unknowns: unknown displacements; components of a node are consecutive. symmetric: whether the factors are U^T D U;
+    else L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):

@@ -5,8 +5,8 @@ Without yield the step is full, even if the residual grows, because rotations of
 at first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
 In yielding soil the step is full if the residual falls, or if the residual forces at its end do less than half of the
-initial work along it. Otherwise the search ends where this work is about zero (Matthies and Strang 1979). There soil
-that unloads is elastic, also in the next tangent. The work includes that of the fluid's residual, because
+initial work along it. Otherwise the search ends where this work is about zero (Matthies and Strang 1979). At that step
+length, soil that unloads is elastic, also in the next tangent. The work includes that of the fluid's residual, because
 the forces' work alone nearly vanishes if only the fluid is out of balance. Shorter steps with smaller residuals would
 lead to more short steps. Bracketed secants find the zero. Soil that has lost its strength needs several secants: with
 one secant, a slumping bank takes twice the Newton steps.
@@ -15,8 +15,8 @@ Flowing soil has almost no stiffness along its mechanisms, and negative stiffnes
 overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
 relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows with
 the step length for any soil. Soil that has not yielded is regularised too, because full steps overshoot just as far
-when this soil first yields. Before any soil yields there is no regularisation while the tangents converge: with it, wet
-elastic soil would take 1.6 times the Newton steps.
+when this soil first yields. Before any soil yields there is no regularisation while the tangents converge: with
+regularisation, wet elastic soil would take 1.6 times the Newton steps.
 
 A few flowing points may give the tangent a negative stiffness. Newton's direction then leads backwards: it unloads
 these points, the next step loads them again, and the iterations cycle. The work of the residuals along the direction is

@@ -4,8 +4,10 @@
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
 
-The solver is GMRES, preconditioned from the right with the upper block triangle, in which the fixed-stress operator P =
-C + beta V replaces the Schur complement C + B K^-1 B^T. One multigrid cycle approximates K^-1, another one P^-1.
+K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES, preconditioned
+from the right with the upper block triangle. In this triangle the fixed-stress operator P = C + beta V replaces the
+Schur complement C + B K^-1 B^T, with the fixed-stress coefficient beta and the cell volumes V. One multigrid cycle
+approximates K^-1, another one P^-1.
 
 In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods were slower; they were tested
 with algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15.  Conjugate gradients on the Schur complement
@@ -23,7 +25,8 @@ MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
 wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long
 as a direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage (p -> p +
-k B u), K is as at nu = 0.3, but GMRES takes 500 iterations: alternating pressures have almost no stiffness.
+k B u), K is as well conditioned as at nu = 0.3, but GMRES takes 500 iterations: alternating pressures have almost no
+stiffness.
 """
 
 from __future__ import annotations
@@ -127,14 +130,7 @@ class BlockOperator:
 class BlockSolver:
     """GMRES for displacements and pressures together.
 
-    Parameters
-    ----------
-    how
-        Solver plan.
-    momentum, storage
-        The matrices.
-    cycles
-        Preconditioners: one multigrid cycle each on K and on P.
+    how: solver plan; momentum, storage: the matrices; cycles: preconditioners, a multigrid cycle on K and one on P.
     """
 
     def __init__(self, how: SolverPlan, momentum: MomentumSystem, storage: StorageSystem, cycles: Inverses):
@@ -171,8 +167,8 @@ class BlockSolver:
 
         Parameters
         ----------
-        scales : (parts,), (parts,)
-            Scales of both residuals in each connected part, N and m^d.
+        scales : (parts,) and (parts,)
+            Scales of the residuals of momentum, N, and fluid, m^d, in each connected part.
         rtol
             Tolerance relative to the norm of both scaled residuals, for each part.
         slopes

@@ -9,12 +9,14 @@ A Newton step of the two problems reads
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p].
 
-`schur-cg` eliminates du, and solves with S = C + B K^-1 B^T by conjugate gradients. The preconditioner is the
-fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr). It is filtered: beta V is smaller for pressures that
-alternate from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full,
-slightly unsymmetric Jacobian. `fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve
-with C + beta V at constant stress, and a momentum solve, alternate. Large bodies use multigrid, because a direct solver
-is too expensive. `schur-cg` and `schur-fgmres` then solve for both unknowns together, see `monolithic`.
+K, B and C are derivatives of the residuals: R_u changes by K du - B^T dp, R_p by B du + C dp. `schur-cg` eliminates du,
+and solves with S = C + B K^-1 B^T by conjugate gradients. The preconditioner is the fixed-stress operator C + beta V,
+with cell volumes V and beta = 0.75 alpha^2 / K_dr (Biot's coefficient alpha, drained bulk modulus K_dr). This operator
+is filtered: beta V is smaller for pressures that alternate from cell to cell
+(`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
+`fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve with C + beta V at constant
+stress, and a momentum solve, alternate. Large bodies use multigrid, because a direct solver is too expensive.
+`schur-cg` and `schur-fgmres` then solve for both unknowns together, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ SOLVED = 0.05
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
 ERROR = 1 / 20
-"""Assumed pressure error of a run, divided by the first-order estimate e.
+"""Assumed pressure error of a run, divided by e, the estimated error of a first-order step (`note_pressures`).
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
 e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
@@ -64,9 +66,9 @@ first step of a load that grows from zero; 0.26 e after a jump.  The largest err
 SUDDEN = np.sqrt(2)
 """Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
 
-The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2). The changes there
-are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma if pressures follow loads.
-Source: exact, the ratio of these changes.
+With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
+sqrt(2). The changes there are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma
+if pressures follow loads.  Source: exact, the ratio of these changes.
 """
 
 
@@ -164,14 +166,8 @@ def note_pressures(
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
-    Parameters
-    ----------
-    seconds
-        Weight of the first rates in the step, s.
-    dt
-        Length of the step, s.
-    of_bodies
-        Function of active owned cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
+    seconds: weight of the first rates in the step, s; dt: length of the step, s; of_bodies: function of active owned
+    cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -214,7 +210,7 @@ class Newton:
         self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
-        """Solve both balances by Newton's method; a tangent is kept while it converges, by linear laws over many steps.
+        """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
 
         serves: whether the tangent of the previous substep may be reused.
         """

@@ -33,8 +33,7 @@ class Numerics:
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
         requires dry or saturated soil in plane strain, no inertia, no `Contact`, and `quadrature="domain"`.
     keep_volumes
-        Whether corners of yielded particle domains are corrected so that the domains keep the volumes of their points,
-        see `domains/kept_volumes.py`. It requires `quadrature="domain"`.
+        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`; only `"domain"`.
     petsc_options
         PETSc options for the solvers, see `Scheme`.
 
@@ -49,7 +48,7 @@ class Numerics:
     tolerance: float = 1e-8
     method: str = "sdirk2"
     renewal: bool = False
-    keep_volumes: bool = False
+    keep_volumes: bool = True
     petsc_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -58,8 +57,6 @@ class Numerics:
         substeps(self.method, True)
         flag("renewal", self.renewal)
         flag("keep_volumes", self.keep_volumes)
-        if self.keep_volumes and self.quadrature != "domain":
-            raise ValueError(f"keep_volumes = True: must be False with quadrature = {self.quadrature!r}")
         _ = self.scheme  # checks coupling, tolerance and options
 
     @property

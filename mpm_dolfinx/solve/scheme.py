@@ -17,7 +17,8 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes, and the factor f of beta = f alpha^2 / K_dr in their fixed-stress operator; None: beta = 1/K_w."""
+"""Coupling schemes, each with the factor f in the fixed-stress coefficient beta = f alpha^2 / K_dr; None: beta = 1/K_w.
+"""
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,13 @@
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
 
-Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S, preconditioned with the
-fixed-stress operator. For large bodies GMRES solves for both unknowns together, see `monolithic`.
+K, B and C: see `newton`. Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S,
+preconditioned with the fixed-stress operator. For large bodies GMRES solves for both unknowns together, see
+`monolithic`.
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, to the same digits.
-A solve takes 0.8 to 1 times as long. But it needs a copy of -B^T for each tangent, and fixed-stress iterations would
-still need the blocks.
+A solve takes 0.8 to 1 times the time of a solve here. But PCFIELDSPLIT needs a copy of -B^T for each tangent, and
+fixed-stress iterations would still need the blocks.
 """
 
 from __future__ import annotations
@@ -91,12 +92,8 @@ class SchurComplement:
 class Kept:
     """Data that the tangents of a step share; each step starts without them.
 
-    Parameters
-    ----------
-    operator
-        Whether the factors of the fixed-stress operator can be reused.
-    factors
-        Direct solvers that replace multigrid, or None.
+    operator: whether the factors of the fixed-stress operator can be reused; factors: direct solvers that replace
+    multigrid, or None.
     """
 
     operator: bool = False
@@ -106,14 +103,8 @@ class Kept:
 class LinearSolvers:
     """Linear solvers for the matrices of one set of active cells.
 
-    Parameters
-    ----------
-    how
-        Solver plan, see `planned`.
-    scheme
-        Coupling scheme.
-    momentum, storage
-        Matrices and vectors of the balances; storage is None without fluid.
+    how: solver plan, see `planned`; scheme: coupling scheme; momentum, storage: matrices and vectors of the balances;
+    storage is None without fluid.
     """
 
     def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
@@ -184,14 +175,8 @@ class LinearSolvers:
     ) -> bool:
         """Assemble the tangents at (u, p), and factorise them.
 
-        Parameters
-        ----------
-        kept
-            Data that the tangents of the step share.
-        data
-            Integration points, by default the points of the problems.
-        firmness
-            Fraction of the elastic shear stiffness to be added, one number or one for each connected part.
+        kept: data that the tangents of the step share; data: integration points, by default the points of the problems;
+        firmness: fraction of the elastic shear stiffness to be added, one number or one for each connected part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):

@@ -156,8 +156,10 @@ def plan(
         2 or 3.
     wet
         Whether there is fluid.
-    yields, locks
-        Whether any law may yield; whether any law may yield or is nearly incompressible.
+    yields
+        Whether any law may yield.
+    locks
+        Whether any law may yield or is nearly incompressible.
     symmetric
         Whether K is symmetric.
     processes

@@ -51,8 +51,8 @@ TAKES_IN = 0.1
 """Rate of correction of the points' volume defect `owed`, for each cell size that corners of their connected part move.
 
 The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With
-rates of 0, 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress.
-From 0.2 on, pressures of a manufactured solution converge with an order below 1.75. Without motion there is no
+rates of 0, 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave spurious stresses of 7.7, 3.8, 3.7 and
+3.6 %. From 0.2 on, pressures of a manufactured solution converge with an order below 1.75. Without motion there is no
 correction, so the order in time is unaffected. The mean defect of drained parts is not corrected: with a correction, a
 column under varying gravity has order 1.2 in the step.
 
@@ -72,7 +72,7 @@ class Motion:
         All bodies of the scene.
     momentum, storage
         Forms of the two balances, with u and p of a solved step; storage is None without fluid.
-    keep_volumes
+    keeps_volumes
         Whether yielded domains keep the volumes of their points, see `kept_volumes`.
     """
 
@@ -82,12 +82,10 @@ class Motion:
         bodies: Sequence[Body],
         momentum: MomentumForms,
         storage: StorageForms | None,
-        keep_volumes: bool,
+        keeps_volumes: bool,
     ):
-        self._keep_volumes = keep_volumes and materials.evolves
-        self._materials = materials
-        self._momentum = momentum
-        self._storage = storage
+        self.keeps_volumes, self._materials = keeps_volumes, materials
+        self._momentum, self._storage = momentum, storage
         self._trends = storage is None and momentum.elastic and not momentum.linear and momentum.inertia is None
         self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
@@ -121,7 +119,8 @@ class Motion:
         stays
             Whether points that hardly move may keep their pieces.
         carried
-            Function that returns new velocities (`Mass.carried`) for the points' motion (n,) in cells, 0 if cuts stay.
+            Function that returns new velocities (`Mass.carried`) for the points' motion (n,) in cells, 0 for kept
+            pieces.
 
         Raises
         ------
@@ -150,8 +149,8 @@ class Motion:
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
-            if self._keep_volumes:
-                points = self._corrected(points, state, loads, keeps)
+            if self.keeps_volumes:
+                points = self._corrected(points, state, loads, keeps & stays)
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
@@ -227,7 +226,7 @@ class Motion:
         The result is None without gravity. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None:
+        if gravity is None:  # also if nothing conducts: a distant body that conducts must not change pressures
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
@@ -269,7 +268,7 @@ class Motion:
         return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step, in the shape that laws use.
+        """Return F of the points after a step: (n, 3, 3), or (n, 2, 2) if this suffices for the laws.
 
         F is the mean of Delta F_n over the pieces of the point, scaled to the mean of their determinants.
         """
@@ -346,7 +345,7 @@ class Motion:
         return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which components (n, 2^d, d) of corners neither conditions prescribe nor walls fix."""
+        """Return a mask (n, 2^d, d) of components of corners: neither prescribed by conditions nor fixed by walls."""
         fixed = fixed_corners(self._momentum.grid, stage.conditions["walls"], points.corners)
         return ~(given(stage.lattices, points) | fixed)
 
@@ -381,9 +380,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The step adds (increase of the fluid content due to volume and cell pressures - net inflow) / alpha to it, both
-        as fluid mass / density at zero pressure. Soil with a free surface has no defect, because its content excludes
-        drained water. Where keeps (n,) is true, points have no correction.
+        The step adds (increase of the fluid content due to volume and cell pressures - net inflow) / alpha to the
+        defect, both as fluid mass / density at zero pressure. Soil with a free surface has no defect, because its
+        content excludes drained water. Where keeps (n,) is true, points have no correction.
         """
         before = state.points
         cut = on_grid.cut

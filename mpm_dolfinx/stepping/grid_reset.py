@@ -58,7 +58,7 @@ class OnGrid(Keyed):
     cut
         The cut particle domains.
     of_fluid
-        Whether beta is 1/K_w, see `Scheme`.
+        Whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
     """
 
     def __init__(
@@ -256,11 +256,12 @@ class OnGrid(Keyed):
     ) -> list[NDArray[np.float64]]:
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
-        The mean of the pieces' mass potentials in a cell is the cell's potential. Its weight is `store` (m,), m^d/Pa,
-        the pieces' storage; in cells without storage their volume. t: time, s, of the pressures on drained sides.
+        The mean of the pieces' mass potentials in a cell is the cell's potential. The mean is weighted by `store` (m,),
+        m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of the pressures on drained
+        sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
-        hydrostatic pressures `at_rest`.
+        hydrostatic pressures `at_rest`, if there is gravity.
         """
         pieces = self.data.pieces
         contents = self.contents

@@ -52,15 +52,17 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""DEPTH iterations are mixed, until PATIENCE successive residuals are not below LESS times the best one so far.
+"""Anderson mixing uses the last DEPTH iterations, until PATIENCE successive residuals are all above LESS times the
+best.
 
 Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16, or 80
-and 24, iterations are equally many, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3 remain.
+and 24, the number of iterations is the same, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3
+remain.
 """
 REMARKABLE = 0.05
 """Change of stress by balancing, divided by the largest given stress, above which there is a warning.
 
-It is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
+The value is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
 
 
@@ -168,9 +170,11 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return the state reset for a step, and by data name the points (m,) and tractions (m, d), Pa, on quiet sides.
+    """Return the state on the grid of the next step, and tractions on quiet sides.
 
-    The tractions balance stresses, loads of the previous stage, and remaining supports. after: the new stage.
+    The tractions are a dict: name of the point data -> ids (m,) of points on a side, and their tractions (m, d), Pa.
+    The stresses are in equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
+    after: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -204,7 +208,7 @@ def _released(
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with the data that conditions store: initial values, or those of `before`, the same points."""
+    """Return the points with the data that conditions store: initial values, or data of the same points `before`."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
@@ -354,10 +358,11 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 def balanced(scene: Scene, state: State) -> State:
     """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
-    A displacement w of the grid is balanced with the strains of the pieces. Points store the mean strain of their
-    domains. The steps are thus a fixed-point iteration, w <- w + u(w), with Anderson mixing (Walker and Ni 2011). Mean
-    strains cannot balance all nodes; nodal forces `State.held` balance the remainder. Support forces are evaluated at
-    the displacement w, `State.rest`, so sides keep their seeded positions for any prescribed displacement at the start.
+    For points with the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
+    Points store only mean strains of their domains, so w + u(w) is not in equilibrium yet. The fixed-point iteration w
+    <- w + u(w) follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes; nodal forces
+    `State.held` balance the remainder. Support forces are evaluated at the displacement w, `State.rest`, so sides keep
+    their seeded positions for any prescribed displacement at the start.
 
     Raises
     ------
@@ -430,13 +435,13 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a displacement w of the nodes, m, a local array, set to zero outside the cells of supported sides."""
+    """Return w, a local array of nodal displacements, m, with zeros outside the cells of supported sides."""
     nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
     return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the balance of momentum at zero displacement and zero rates, for points that u has strained."""
+    """Return the momentum balance with zero displacement and rates; the points include the strain of a found u."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)

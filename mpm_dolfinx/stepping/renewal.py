@@ -49,10 +49,7 @@ LONGEST = 1.0
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    Parameters
-    ----------
-    bodies, materials
-        Bodies and materials of the scene.
+    bodies, materials: bodies and materials of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body], materials: SceneMaterials):
@@ -187,7 +184,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of outer faces, and an index of the set of conditions on each, -1 if it forbids renewal."""
+        """Return keys of outer faces, and the index of each face's set of conditions; -1: the set forbids renewal."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -240,7 +237,7 @@ class Renewal:
         volume0 = V[group] * size / A[group] / ratio
 
         def kept(values: NDArray) -> NDArray:
-            """Return means with an exact mass-weighted sum; its defect is distributed within the values' range."""
+            """Return means with an exact mass-weighted sum: corrections stay within the values' range."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)

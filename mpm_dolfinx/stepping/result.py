@@ -31,23 +31,32 @@ class Result:
     ----------
     rows
         Records at the output times, see `Row`.
-    steps, newton, coupling, cuts, rejected
-        Numbers so far: steps, Newton iterations, coupling iterations, reduced steps, steps rejected by their error.
+    steps, newton, coupling
+        Numbers of steps, of Newton iterations and of coupling iterations so far.
+    cuts, rejected
+        Numbers of steps that were reduced because they did not converge, and because of their estimated error.
     rederived
         Number of inverted domains that were re-initialised from F.
-    renewed, renewals
-        Number of renewed domains of yielded soil, and of resets of the grid with renewal.
-    balance, residual
-        Largest values so far, relative: error of the fluid mass balance; residual of the momentum and fluid equations.
+    renewed
+        Number of renewed domains of yielded soil.
+    renewals
+        Number of resets of the grid with renewal.
+    balance
+        Largest relative error of the fluid mass balance so far.
+    residual
+        Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall time, s, of the whole run, and of each part of it on this process.
+        Wall time, s, of the whole run, and of each part of the run on this process.
     converged
         Whether the run has reached its end.
     event
         Index in `until`, from 0, of the function that ended the run, and time of the event, s; None without an event.
-    points, memory, imbalance
-        Values at the end of the run: number of material points; peak memory of all processes with libraries, MB;
-        (largest load of a process) / (mean load).
+    points
+        Number of material points at the end of the run.
+    memory
+        Peak memory of all processes with libraries, MB.
+    imbalance
+        (Largest number on a process) / (mean number) at the end of the run, see `summary.imbalance`.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -135,11 +144,11 @@ class Result:
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        kinetic and elastic belong to the bodies and free tools; elastic is 0 for laws without an energy. Others are the
-        work since the start of the run: external of all loads; viscous on quiet sides and by user-defined terms;
-        friction of slip at tools and between groups; internal of the stresses. dissipated is internal minus elastic,
-        in wet bodies with the work of flow and storage of water. kinetic + elastic + dissipated + viscous + friction -
-        external is constant, up to losses of the method.
+        `kinetic` and `elastic` are energies of the bodies and free tools; `elastic` is 0 for laws without an energy.
+        Works since the start of the run: `external`, of all loads; `viscous`, on quiet sides and of user-defined terms;
+        `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
+        `elastic`, in wet bodies with the work of flow and storage of water. `kinetic` + `elastic` + `dissipated` +
+        `viscous` + `friction` - `external` is constant, up to losses of the method.
         """
         return self.outcome("energy")
 

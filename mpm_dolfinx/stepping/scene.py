@@ -121,7 +121,8 @@ class Scene:
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
             of_fluid = (scene, weight, symmetric, feeding, inertial)
             self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
-        self.motion = Motion(scene, bodies, self.momentum, self.storage, self.numerics.keep_volumes)
+        keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
+        self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
         # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
         self._assembled: Latest[Assembled] = Latest()
@@ -153,14 +154,8 @@ class Scene:
     ) -> MomentumProblem:
         """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
 
-        Parameters
-        ----------
-        when
-            The substep.
-        system, data, loads, options
-            See `MomentumProblem`.
-        u : (unknowns,), m
-            Displacements at which the iterations begin, a local array; None: the present displacements.
+        when: the substep; system, data, loads, options: see `MomentumProblem`; u (unknowns,), m: displacements at which
+        the iterations begin, a local array; None: the present displacements.
         """
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
@@ -278,14 +273,8 @@ class Scene:
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
-        Parameters
-        ----------
-        now
-            Present loads.
-        as_cut
-            Function that returns the loads at the positions at which domains were cut.
-        begins
-            Whether all parts of the bodies must have supports.
+        now: present loads; as_cut: function that returns the loads at the positions at which domains were cut; begins:
+        whether all parts of the bodies must have supports.
         """
 
         def make() -> Assembled:

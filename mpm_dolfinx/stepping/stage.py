@@ -207,8 +207,10 @@ def stage(
         Forms with the loads of all stages, and terms of all stages in the balance of fluid.
     conditions
         walls, conditions, gravity and inertia: see `Simulation`.
-    present, later
-        Whether each body is present; indices of bodies still to be added.
+    present
+        Whether each body is present.
+    later
+        Indices of bodies still to be added.
 
     Raises
     ------

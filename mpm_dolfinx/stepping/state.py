@@ -106,7 +106,7 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float) -> NDArray[np.float64]:
-        """Return the changes (n, d, 1 + d) of x, m, and F in a time (s), by the parabola through the last states."""
+        """Return changes (n, d, 1 + d) of x, m, and F in a time, s: extrapolated parabola through the last states."""
         rate = self.rates[:, 0]
         if len(self.lengths) > 1:
             rate = rate + (seconds + self.lengths[0]) / self.lengths.sum() * (rate - self.rates[:, 1])
@@ -135,10 +135,11 @@ class State:
         relative to its `base`; None before a reset, and for other grids.
     outcome
         Results of conditions at the end of the last step, by quantity and name; nan for new conditions before the first
-        step of a stage. reactions (d,), N, of prescribed displacements; wall_reactions (d,), N, of the grid's walls;
-        outflows, m^3/s (m^2/s in plane strain), through open sides, as volumes at zero pressure; tool_forces (d + 1,),
-        in 3D (6,), N and N m, of tools and contacts on the bodies; tool_travel, m, displacements of load-controlled
-        tools without the prescribed ones; and results of user-defined conditions.
+        step of a stage. `reactions` (d,), N: of prescribed displacements. `wall_reactions` (d,), N: of the grid's
+        walls. `outflows`, m^3/s (m^2/s in plane strain): through open sides, as volumes at zero pressure. `tool_forces`
+        (d + 1,), in 3D (6,): forces, N, and moments, N m, of tools and contacts on the bodies. `tool_travel`, m:
+        displacement of a load-controlled tool in addition to a prescribed displacement. Other keys: user-defined
+        conditions.
     stage
         The present stage, with its conditions.
     begins

@@ -118,7 +118,7 @@ def cavity(
     elements
         Number of elements; their sizes form a geometric progression.
     state
-        Initial state variables of the law; by default those of the material.
+        Initial state variables of the law; by default as the material has them.
     """
     R, rings = np.geomspace(1, outer, elements + 1), _Rings(material, elements, state)
     far = -float(rings.kirchhoff(np.ones((elements, 2)), rings.start)[-1, 0])

@@ -200,7 +200,7 @@ class Mandel:
 
 
 def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure at the centre of a sphere under surface load that drains at its surface.
+    """Return the pore pressure at the centre of a sphere that is loaded and drains at its surface.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ class SelfWeightColumn:
         return lambertw(-self.stress(Y) / (self.bulk + 4 / 3 * self.shear)).real
 
     def stress(self, Y: ArrayLike) -> Array:
-        """Return the vertical Cauchy stress (...), Pa, at heights Y (...), m, in [0, l0]. Source: the weight above."""
+        """Return the vertical Cauchy stress (...), Pa, at heights Y (...), m, in [0, l0]; it bears the weight above."""
         return -self.density * self.gravity * (self.l0 - _within("Y", Y, self.l0))
 
     def stretch(self, Y: ArrayLike) -> Array:
