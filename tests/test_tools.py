@@ -164,11 +164,11 @@ def on_a_floor(way, cells, length, delta, floor, steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cells", "error"), [(10, 0.11), (20, 0.06)])
-def test_a_wall_that_gives_way_on_a_rough_floor_nears_rankine_s_pressure(cells, error):
-    """To first order in h: Q1 velocities over-constrain the sand that flows from the toe, see `best_mechanism`."""
-    K = on_a_floor(-0.001, cells, 1.5, 0.0, {"friction": 0.8}, 5)
-    assert K[-1] == pytest.approx(1 / 3, rel=error)
+def test_a_wall_that_gives_way_on_a_rough_floor_nears_rankine_s_pressure():
+    """Q1 velocities over-constrain the sand that flows from the toe: its best mechanism has a larger error."""
+    errors = [3 * on_a_floor(-0.001, cells, 1.5, 0.0, {"friction": 0.8}, 5)[-1] - 1 for cells in (10, 20)]
+    print(errors)
+    assert max(thrust(10, 0.5), -0.11) < errors[0] < 1.5 * errors[1] < 0
 
 
 def test_constraints_of_dilatant_cells_and_friction_at_the_toe_lower_the_thrust_of_the_best_mechanism():
