@@ -371,16 +371,16 @@ def _constant(points, value: float) -> fem.Constant:
 class Shown:
     """What a scene shows at a time, in the frame of its description; arrays over its points by places at rest.
 
-    Where domains are renewed places are those now.  steps: that the run took so far; where some are cut there are more.
+    Where domains are renewed places are those now.  steps: how many the run took up to each output so far.
     """
 
     place: NDArray[np.float64]
     fields: dict[str, NDArray[np.float64]]
-    steps: int
+    steps: list[int]
 
 
-def shown(built: Built) -> Shown:
-    """Return what a simulation shows now."""
+def shown(built: Built, steps: list[int]) -> Shown:
+    """Return what a simulation shows now; steps: see `Shown`."""
     scene, frame, s = built.scene, built.frame, built.simulation
     points, d = s.points, scene.dim
     number = body_of(points.id, np.cumsum([0, *map(len, s.bodies)]))
@@ -416,7 +416,7 @@ def shown(built: Built) -> Shown:
     if any(tool.mass for tool in scene.tools):
         fields["travel"] = frame.vector_back(fields["travel"])
         fields["rotation"] = s.outcome("tool_rotation").array * frame.turn
-    return Shown(frame.place_back(places, scene), fields, s.result.steps)
+    return Shown(frame.place_back(places, scene), fields, list(steps))
 
 
 def _stage(built: Built) -> None:
@@ -440,22 +440,24 @@ def _stage(built: Built) -> None:
 def run(scene: Scene, frame: Frame) -> list[Shown]:
     """Return what a scene shows at the ends of its stages."""
     built, dt, end = build(scene, frame), scene.end * frame.time / scene.steps, scene.end * frame.time
+    steps: list[int] = []
+    options = {"progress": False, "observe": lambda simulation: steps.append(simulation.result.steps)}
     if scene.rtol:
-        built.simulation.run(end, rtol=scene.rtol, t_eval=[end], progress=False)
+        built.simulation.run(end, rtol=scene.rtol, t_eval=[end], **options)
     elif frame.cut:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "cut"
-            built.simulation.run(dt, dt, checkpoint=mpm.Checkpoint(file), progress=False)
+            built.simulation.run(dt, dt, checkpoint=mpm.Checkpoint(file), **options)
             built = build(scene, frame)
             before = mpm.resume(built.simulation, file)
-        built.simulation.run(end, dt, after=before, progress=False)
+        built.simulation.run(end, dt, after=before, **options)
     else:
-        built.simulation.run(end, dt, progress=False)
-    out = [shown(built)]
+        built.simulation.run(end, dt, **options)
+    out = [shown(built, steps)]
     if scene.stage:
         _stage(built)
-        built.simulation.run(end + dt, dt, progress=False)
-        out.append(shown(built))
+        built.simulation.run(end + dt, dt, **options)
+        out.append(shown(built, steps))
     return out
 
 
