@@ -147,9 +147,10 @@ class StepSize:
 
         A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
         jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
+        Nor are changes of a body that are only rounding, compared with those of other bodies.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
-        return bool((excess > RINGS * np.asarray(control.change)).any())
+        return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
         """Return (length of a step with the tolerated error) / (length of the solved step)."""
