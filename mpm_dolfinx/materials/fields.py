@@ -522,7 +522,7 @@ class SceneMaterials:
             return points.data
         placed = self._placed(points)
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
-        finite = [np.isfinite(values).reshape(len(rows), -1).all(axis=1) for _, rows, _, values in new]
+        finite = [np.isfinite(values).all(axis=tuple(range(1, np.ndim(values)))) for *_, values in new]
         invalid = [(law, name, rows[~good]) for (law, rows, name, _), good in zip(new, finite, strict=True)]
         messages = [
             f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]] + self.grid.base}"
