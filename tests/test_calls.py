@@ -44,7 +44,7 @@ def calls(run):
 
 @pytest.mark.parametrize(
     ("scene", "newton", "most"),
-    [(block, 6, 4685), (dry_beam, 3, 2610 if _compat.OLD else 9700)],  # dolfinx 0.9 makes forms of other cells anew
+    [(block, 4, 4395), (dry_beam, 3, 2400 if _compat.OLD else 9700)],  # dolfinx 0.9 makes forms of other cells anew
     ids=["draining block", "dry beam"],
 )
 def test_a_step_calls_no_more_functions_than_before(scene, newton, most):
@@ -54,7 +54,7 @@ def test_a_step_calls_no_more_functions_than_before(scene, newton, most):
     def steps(count):
         reports.extend(s.step(0.1) for _ in range(count))
 
-    steps(2)
+    steps(5)
     made = calls(lambda: steps(4)) / 4
-    assert [report.newton for report in reports[2:]] == [newton] * 4, "other Newton steps cost other calls"
+    assert max(report.newton for report in reports[5:]) == newton, "other Newton steps cost other calls"
     assert made <= most

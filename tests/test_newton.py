@@ -59,6 +59,28 @@ def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thous
     assert s.points.F[:, 1, 1] - 1 == pytest.approx(np.full(len(s.points), e), rel=1e-5)
 
 
+def pressed_block(t_jump=np.inf):
+    """Return a draining block under a load that grows with time, and falls to a fifth at t_jump (s)."""
+    grid = mpm.Grid([0, 0], [1, 1.25], [4, 5])
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t * (0.2 if t > t_jump else 1.0)))
+    conditions = [load, mpm.Drained("top")]
+    soil, body = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-4), mpm.box(grid, [0, 0], [1, 1])
+    return mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls=SIDES | {"bottom": "y"}, conditions=conditions)
+
+
+@pytest.mark.parametrize("t_jump", [np.inf, 0.75])
+def test_an_extrapolated_start_saves_newton_steps_and_changes_no_result_even_after_a_jump(t_jump):
+    """The same steps are taken from rest."""
+    ahead, from_rest, counts = pressed_block(t_jump), pressed_block(t_jump), []
+    for _ in range(10):
+        from_rest.state = replace(from_rest.state, trend=None)
+        counts.append([s.step(0.1).newton for s in (ahead, from_rest)])
+    for name in ("corners", "pressure"):
+        one, other = (getattr(s.state.points, name) for s in (ahead, from_rest))
+        assert np.abs(one - other).max() <= 1e-7 * np.abs(other).max()
+    assert counts[-1][0] < counts[-1][1] or t_jump < 1
+
+
 def stretch(load):
     """Return the stretch of a bar of SOIL, held across, by a load over its modulus (dead): ln a / a."""
     return brentq(lambda a: np.log(a) / a - load, 1, 2)

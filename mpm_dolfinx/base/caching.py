@@ -36,7 +36,7 @@ class Latest(Generic[T]):
         make: function that computes the value; comm: processes that compute the value together.  If one process needs a
         new value, all compute it.
         """
-        other = self._entry is None or not same(self._entry[0], key)
+        other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))
         if other if comm.size == 1 else over_all(comm, other) > 0:
             self._entry = None
             for one in self._derived:

@@ -140,9 +140,9 @@ def linear_gradients(
     ratio = np.trace(e, axis1=1, axis2=2)
     # the mean is weighted by reference volumes; the second-order part would change the domain's volume and is removed
     variances = sum_by(of, np.array([[fraction * x * y for y in xi] for x in xi]), len(F))
-    weight, part = np.einsum("abn,bn->an", variances, ratio), np.einsum("abn,bjkn->ajkn", variances, e)
-    second = 0.5 * (np.einsum("an,aikn->ikn", weight, e) - np.einsum("aijn,ajkn->ikn", e, part))
-    base = base - np.einsum("ijn,jkn->ikn", base, second) + np.einsum("an,aijn->ijn", weight, slope)
+    weight, part = np.add.reduce(variances * ratio, axis=1), np.einsum("abn,bjkn->ajkn", variances, e)
+    second = 0.5 * (np.add.reduce(weight[:, None, None] * e) - np.einsum("aijn,ajkn->ikn", e, part))
+    base = base - np.einsum("ijn,jkn->ikn", base, second) + np.add.reduce(weight[:, None, None] * slope)
     out = base.take(of, axis=2) + sum(x * slope[a].take(of, axis=2) for a, x in enumerate(xi))
     out = np.ascontiguousarray(out.transpose(2, 0, 1))
     ratios = determinant(out)
@@ -173,7 +173,7 @@ def _slopes(
             neighbours_columns, at_face, known = others(face)
             joined = known & (np.abs(at_face - faces[face]) <= nearest).all(axis=0)
             joined &= (neighbours_columns[k * k + d :] == own[k * k + d :]).all(axis=0)
-            xi = np.einsum("abn,bn->an", inverse, neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d])
+            xi = np.add.reduce(inverse * (neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d]), axis=1)
             xi[:, ~joined] = 0.0
             change = neighbours_columns[: k * k] - own[: k * k]
             B += xi[:, None] * change

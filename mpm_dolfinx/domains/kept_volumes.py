@@ -9,9 +9,8 @@ overfill.  After a step the corners of yielded domains therefore move by the d t
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 
 with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells.  Both sums
-are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of elastic
-domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of grid cells in this way (implicit
-density projection).  Volumes of domains, unlike densities, need no second cut by the grid.
+are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together; corners of elastic
+domains and held corners stay.  Kugelstadt et al. (2019) so correct densities of cells (implicit density projection).
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class Reconstruction:
         on = sign * slope[at, axis] * depth
         low, high = _bounds_of(jump)
         low, high = low + sum_by(at, np.minimum(on, 0), len(cells)), high + sum_by(at, np.maximum(on, 0), len(cells))
-        increment = np.einsum("md,md->m", slope[slot], x - centroid[cells[slot]])
+        increment = np.add.reduce(slope[slot] * (x - centroid[cells[slot]]), axis=1)
         return p[cells[slot]] + share_within(increment, low, high, slot)[slot] * increment
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -123,7 +123,7 @@ class DrainedSides(Feeding):
         size, offset = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
         least = wet.contents.fill[wet.contents.slot(cell)] * grid.sizes(cell).min(axis=-1) / THICK / (grid.dim + 1)
         normal = area / size[:, None]
-        distance = np.einsum("md,md->m", offset, normal)
+        distance = np.add.reduce(offset * normal, axis=1)
         shape = size / np.maximum(distance, least)
         if grid.axisymmetric:  # uses the circumference half-way to the centroid
             shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))

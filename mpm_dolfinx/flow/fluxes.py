@@ -137,7 +137,7 @@ class OpenSides:
     @cached_property
     def normal(self) -> NDArray[np.float64]:
         """Outward unit normals (m, d)."""
-        return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
+        return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
@@ -162,7 +162,7 @@ class OpenSides:
         at (m,): index of the cell of each face among the filled cells; p (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
-        distance = np.einsum("md,md->m", self.offset, self.normal)
+        distance = np.add.reduce(self.offset * self.normal, axis=1)
         # prescribed inflows have no conductance; closed seepage faces have no pressure
         drained = ((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure))).nonzero()[0]
         at = at[drained]
@@ -230,6 +230,7 @@ class CellContents(Keyed):
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
         at = grid.midpoints[filled] + centroid[filled]
+        self._unit = np.eye(d)
         self._shapes = np.dstack([grid.shape_gradients(filled, at), grid.shape_values(filled, at)])
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
@@ -271,11 +272,11 @@ class CellContents(Keyed):
         """Return the motion of filled cells at centroids, for nodal displacements, m; cells `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
-        F, moved = np.eye(d) + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
+        F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
         if rests is not None:
-            F[rests], moved[rests] = np.eye(d), 0.0
+            F[rests], moved[rests] = self._unit, 0.0
             if hoop is not None:
                 hoop[rests] = 1.0
         return CellMotion(F, moved, hoop)

@@ -198,4 +198,4 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
     """Return vectors (m, d), m, along faces: from the foot of the perpendicular through the centroid to the centre."""
-    return sides.offset - np.einsum("md,md->m", sides.offset, sides.normal)[:, None] * sides.normal
+    return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

@@ -113,7 +113,7 @@ class FormPoints:
         """
         if "gradient" not in self.live:
             values = u.x.array
-            self.follow("gradient", (self.grid.dim, self.grid.dim), lambda data: data.gradients(values))
+            self.follow("gradient", (self.grid.dim, self.grid.dim), partial(PointData.gradients, u=values))
         return self.functions["gradient"]
 
     def follow(self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray]) -> fem.Function:

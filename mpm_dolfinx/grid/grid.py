@@ -615,7 +615,7 @@ class Grid:
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
-            stride = int(np.prod(self.shape[axis + 1 :]))
+            stride = prod(self.shape[axis + 1 :].tolist())
             for end, inside in enumerate((index[:, axis] > 0, index[:, axis] < self.shape[axis] - 1)):
                 out[inside, axis, end] = self.locals[self.cell_number[cells[inside]] + (2 * end - 1) * stride]
         return out

@@ -32,7 +32,7 @@ from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay, StepControl, Trend
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 13  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 14  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
@@ -201,7 +201,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         of_trend = _part(arrays, "trend/")
         trend = Trend(**of_trend) if of_trend else None
         if trend is not None:
-            _check_trend(trend, points)
+            _check_trend(trend, points, wet)
         lines = _part(arrays, "lines/") or None
         if lines is not None:
             _check_lines(lines, simulation.grid)
@@ -350,10 +350,10 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
     arrays |= {"node": node, "values": values}
 
 
-def _check_trend(trend: Trend, points: MaterialPoints) -> None:
+def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
     """Raise ValueError for a `Trend`, the motion in the last steps, that does not belong to the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
-    right = k in (1, 2) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d, 1 + d)
+    right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
     if not (right and numbers_only and (trend.lengths > 0).all()):
         raise ValueError("trend: does not fit the points, is not finite, or has a step without length")

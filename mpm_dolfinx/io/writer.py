@@ -172,7 +172,8 @@ class Writer:
     def _write_grid(self, simulation: Simulation) -> None:
         comm, stem = simulation.grid.comm, self._grid.next
         with _true_places(simulation.grid):
-            _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
+            with io.VTKFile(comm, str(stem.with_suffix(".pvd")), "w") as f:  # writes its index again when it is closed
+                f.write_function(_grid_fields(simulation), simulation.t)
         if comm.rank == 0:  # the index of this writer lists the files of all processes; dolfinx 0.5 repeats them
             stem.with_suffix(".pvd").unlink(missing_ok=True)
             stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
@@ -306,11 +307,6 @@ def _true_places(grid: Grid) -> Iterator[None]:
         yield
     finally:
         x[:] = own
-
-
-def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t: float) -> None:
-    with io.VTKFile(comm, str(file), "w") as f:  # writes its index again when it is closed
-        f.write_function(fields, t)
 
 
 def _ends(file: Path) -> bool:

@@ -522,7 +522,8 @@ class SceneMaterials:
             return points.data
         placed = self._placed(points)
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
-        invalid = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
+        finite = [np.isfinite(values).reshape(len(rows), -1).all(axis=1) for _, rows, _, values in new]
+        invalid = [(law, name, rows[~good]) for (law, rows, name, _), good in zip(new, finite, strict=True)]
         messages = [
             f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]] + self.grid.base}"
             for law, name, i in invalid
@@ -559,11 +560,6 @@ def _known(name: str, value) -> NDArray[np.float64]:
 
 def _names_place(law: Callable) -> bool:
     return "x" in signature(law).parameters
-
-
-def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which rows (n,) of values (n, ...) are finite."""
-    return np.isfinite(values).all(axis=tuple(range(1, np.ndim(values))))
 
 
 def _takes(law: type[Skeleton]) -> list[str]:

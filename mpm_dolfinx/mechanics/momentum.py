@@ -237,23 +237,24 @@ class MomentumForms:
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data, sums)
 
-    def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (nodes,) over the cells at each node; values (cells,), or (cells, 2^d) for their nodes."""
-        (shared, values_at), d = self._rooms[0], self.grid.dim
-        nodes = self.active.now.nodes
+    def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return sums (k, nodes) over the cells at each node, of k values of cells (cells, 1) or nodes (cells, 2^d)."""
+        (shared, values_at), nodes = self._rooms[0], self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
-        values_at[self.active.now.dofs] = 0.0
-        of_cells = np.broadcast_to(values if values.ndim > 1 else values[:, None], at.shape)
-        values_at[nodes * d] = sum_by(at.ravel(), of_cells.ravel(), len(nodes))
-        sum_ghosts(shared)
-        shared.x.scatter_forward()
-        return values_at[nodes * d]
+        of_nodes = np.array([of + np.zeros(at.shape) for of in values])
+        out = sum_by(at.ravel(), of_nodes.reshape(len(values), at.size), len(nodes))
+        for row in out if self.grid.comm.size > 1 else ():
+            values_at[self.active.now.dofs] = row.repeat(self.grid.dim)
+            sum_ghosts(shared)
+            shared.x.scatter_forward()
+            row[:] = values_at[nodes * self.grid.dim]
+        return out
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
         """Return the connected parts of the bodies; `of` and `count` are the results of `OnGrid.parts_of_cells`."""
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
         own = self.active.now.cells[self.active.now.cells < grid.num_owned]
-        total, count_of = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
+        total, count_of = self.at_nodes(own, [of[own, None], np.ones((len(own), 1))])
         nodes[self.active.now.nodes] = np.rint(total / count_of).astype(np.int64) - 1
         return Parts(count, of - 1, nodes)
 
@@ -465,8 +466,11 @@ class MomentumProblem:
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
-        dofs = self.forms.active.now.dofs
-        return [np.where(self.system.unknowns.map.indices[dofs] >= 0, values[dofs], 0.0) for values in found]
+        return [self.freely(values[self.forms.active.now.dofs]) for values in found]
+
+    def freely(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return displacements (active dofs,), m, with zeros where walls fix them."""
+        return np.where(self.system.unknowns.map.indices[self.forms.active.now.dofs] >= 0, values, 0.0)
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, N: the largest norm of the force terms."""

@@ -104,13 +104,8 @@ def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
         return (ax * by - ay * bx) / 2
     total = 0.0
     for (p, q, r, s), sign in zip(y[FACES[3]], FACE_SIGNS, strict=True):
-        total = total + sign * _triple(p + q + r + s, s - p, r - q)
+        total = total + sign * ((p + q + r + s) * cross(s - p, r - q)).sum(axis=0)
     return total / 24
-
-
-def _triple(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the triple products (n,) of vectors (3, n)."""
-    return (a * cross(b, c)).sum(axis=0)
 
 
 def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -91,6 +91,7 @@ def _laws(s: Scene) -> str:
 
 def _solvers(s: Scene, state: State) -> list[Part]:
     kind = "symmetric" if s.momentum.symmetric and state.stage.symmetric else "unsymmetric: LU and FGMRES"
+    once = "first order in time" if s.numerics.method == "backward-euler" else "no time derivatives"
     return [
         _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
@@ -100,12 +101,8 @@ def _solvers(s: Scene, state: State) -> list[Part]:
             "the tangent depends on the strain",
         ),
         Part("linear solvers", True, str(s.last[1].plan) if s.last[1] else "planned in the first step"),
-        _either("second substep", len(s.substeps) > 1, "second order in time", _one_substep(s)),
+        _either("second substep", len(s.substeps) > 1, "second order in time", once),
     ]
-
-
-def _one_substep(s: Scene) -> str:
-    return "first order in time" if s.numerics.method == "backward-euler" else "no time derivatives"
 
 
 def table(scene: Scene, state: State) -> str:

@@ -313,7 +313,7 @@ def _accepted(
     """Return the state after a step of length `size`, s, with its histories; preferred: nominal step, s."""
     grown = measured(start.control, report)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
-    grown = replace(grown, first=(report.first / size).tolist())
+    grown = replace(grown, first=np.divide(report.first, size).tolist())
     return replace(new, result=start.result.after(report), control=grown)
 
 

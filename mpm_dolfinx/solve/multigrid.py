@@ -108,7 +108,8 @@ def interpolations(
     size = before = over_all(comm, len(places))
     while not steps or coarsest < size < 0.7 * before:  # many bodies of a few cells cannot be coarsened
         Q, places, held = interpolation(comm, places, held, nodal, lines)
-        lines = None if lines is None else [_every_other(x) for x in lines]
+        if lines is not None:  # half as many cells, of which the last one may extend beyond the grid
+            lines = [x[::2] if len(x) % 2 else np.append(x[::2], 2 * x[-1] - x[-2]) for x in lines]
         size, before = over_all(comm, len(places)), size
         steps.append(Q)
     return steps
@@ -149,11 +150,6 @@ def interpolation(
     sizes = (len(places), None), (np.count_nonzero(owned), None)
     found = np.column_stack(np.unravel_index(keys, shape)) - 1
     return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[owned], found[(number == NONE) & nodal]
-
-
-def _every_other(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lines (m,), m, of the grid with half as many cells; its last cell may extend beyond the grid."""
-    return x[::2] if len(x) % 2 else np.append(x[::2], 2 * x[-1] - x[-2])
 
 
 def _hats(

@@ -102,6 +102,7 @@ def solve_substep(
     solvers: LinearSolvers,
     momentum: MomentumProblem,
     storage: StorageProblem | None,
+    ahead: Callable[[], list[NDArray[np.float64]]] | None,
     as_reset: AsReset,
     key: Hashable,
     report: Report,
@@ -115,6 +116,8 @@ def solve_substep(
         Linear solvers for the unknowns of the active cells.
     momentum, storage
         The balances; storage is None without fluid.
+    ahead
+        Function that returns (u, p) extrapolated from the last steps, in active dofs and cells, or None.
     as_reset, key
         See `OnGrid.as_reset`. Linear laws use this tangent while the key stays the same.
     report
@@ -130,8 +133,9 @@ def solve_substep(
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
     serves = report.newton > 0 and momentum.smooth
+    follows = not report.history or max(report.history[0]) ** 2 <= solvers.plan.keep  # the first substep began there
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual shows a failed solve
-        errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
+        errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves, ahead if follows else None)
         took = newton.report
         if took.newton and storage is None and solvers.plan.symmetric and not solvers.plan.iterative:
             newton.check_stable()
@@ -209,12 +213,12 @@ class Newton:
         forms, active = momentum.forms, momentum.forms.active.now
         self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
 
-    def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
+    def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
         """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
 
-        serves: whether the tangent of the previous substep may be reused.
+        serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """
-        errors, other = self._begin()
+        errors, other = self._begin(ahead)
         fresh = self._linear or not serves
         if other is not None:
             try:
@@ -269,17 +273,28 @@ class Newton:
             errors, count = self._errors(errors.start), count + 1
         return errors
 
-    def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors at the starting point: a guess that is better than the present (u, p), if any.
+    def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
+        """Return the errors at the starting point: a guess with a smaller residual than the present (u, p), if any.
 
-        A better guess has less potential energy in elastic bodies, else a smaller residual.  (Bending needs small
-        forces: its best guess may have a larger residual than the present u.)  Also return the other start, or None.
+        A Newton step `ahead` must leave a small residual: its square. Also return the other start, or None.
         """
-        errors, start = self._errors(), self._iterate()
+        start = self._iterate()
+        if ahead is not None:
+            u, *p = ahead()
+            self._go_to([self._momentum.freely(u), *p])
+            errors, _ = self._tried(None)
+            worst = np.inf if errors is None else errors.worst
+            if errors is not None and errors.fluid is not None:  # without flow, wrong volumes look like exchanged fluid
+                flows = np.abs(self._storage.net_inflow(errors.fluid.rates)).sum()
+                worst = max(worst, errors.fluid.off.sum() / over_all(self._solvers.du.comm.tompi4py(), flows))
+            if worst**2 <= self._solvers.plan.keep:
+                return errors, start
+            self._go_to(start)
+            self.report.history.clear()
+        errors = self._errors()
         guesses = [] if self._linear or errors.worst <= self._scheme.tolerance else self._momentum.guesses()
-        measure = self._potential() if self._momentum.smooth else lambda errors: errors.u
         at = last = start[0]
-        least = measure(errors)
+        least = errors.u
         for guess in guesses:
             self._go_to([guess, *start[1:]])
             last = None
@@ -287,24 +302,14 @@ class Newton:
                 found = self._errors(errors.start)
             except NotConverged:
                 continue
-            value = measure(found)
-            better = value < least  # p is the same; its residual is meaningless before any fluid has been exchanged
+            better = found.u < least  # p is the same; its residual is meaningless before any fluid has been exchanged
             if better.any():
                 at = guess if better.all() else np.where(better[self._parts], guess, at)
-                least, last = np.minimum(value, least), at if better.all() else None
+                least, last = np.minimum(found.u, least), at if better.all() else None
         if last is not at:
             self._go_to([at, *start[1:]])
             found = self._errors(errors.start)
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
-
-    def _potential(self) -> Callable[[Errors], NDArray[np.float64]]:
-        """Return a function: twice the potential energy (parts,), J, at the u of its call, minus that at the present u.
-
-        The difference is the work of the residuals, by the trapezoidal rule. Residuals must be assembled at both u.
-        """
-        system = self._momentum.system
-        r, u = system.residual.array_r.copy(), system.step.array_r.copy()
-        return lambda _: system.of_parts.sums((system.residual.array_r + r) * (system.step.array_r - u))
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
@@ -320,6 +325,7 @@ class Newton:
         """Set (u, p) to an iterate."""
         for (f, rows), values in zip(self._functions, iterate, strict=True):
             f.x.array[rows] = values
+            f.x.scatter_forward()
 
     def check_stable(self) -> None:
         """Raise NotConverged at an unstable equilibrium, because smaller steps find the path that leaves it.
@@ -482,11 +488,13 @@ class Newton:
             if not searches:
                 return errors
 
-    def _tried(self, before: Errors) -> tuple[Errors, NotConverged | None]:
+    def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
         """Return the errors after a trial step, infinite where a law cannot be evaluated, and its exception or None."""
         try:
-            return self._errors(before.start), None
+            return self._errors(before and before.start), None
         except NotConverged as failed:
+            if before is None:
+                return None, failed
             self.report.history.append((np.inf, np.inf))
             away = np.where(before.each > self._scheme.tolerance, np.inf, before.each)
             return replace(before, u=away, p=away), failed

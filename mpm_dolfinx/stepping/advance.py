@@ -86,7 +86,8 @@ class Motion:
     ):
         self.keeps_volumes, self._materials = keeps_volumes, materials
         self._momentum, self._storage = momentum, storage
-        self._trends = storage is None and momentum.elastic and not momentum.linear and momentum.inertia is None
+        varies = not momentum.linear if storage is None else not (storage.drains or storage.retains)
+        self._trends = varies and momentum.elastic and momentum.inertia is None
         self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
@@ -188,37 +189,40 @@ class Motion:
 
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
         """Return the trend of the points after a step of dt (s)."""
-        d, before = points.x.shape[1], state.trend
-        moved = (points.x - state.points.x)[:, :, None]
-        rates = np.concatenate([moved, (points.F - state.points.F)[:, :d, :d]], axis=2)[:, None] / dt
-        if before is None:
-            return Trend(np.array([dt]), rates)
-        return Trend(np.append(dt, before.lengths[:1]), np.concatenate([rates, before.rates[:, :1]], axis=1))
+        (n, d), before = points.x.shape, state.trend
+        change, gradient_change = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
+        pressure = (points.pressure - state.points.pressure)[:, None] if self._storage is not None else change[:, :0]
+        rates = np.concatenate([change, gradient_change, pressure], axis=1)[:, None] / dt
+        lengths, past = ([], rates[:, :0]) if before is None else (before.lengths[:2], before.rates[:, :2])
+        return Trend(np.append(dt, lengths), np.concatenate([rates, past], axis=1))
 
-    def ahead(self, on_grid: OnGrid, state: State, seconds: float) -> NDArray[np.float64]:
-        """Return displacements (unknowns,), m, in the next `seconds`, s, from the trend of the state, as local array.
+    def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
+        """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
 
-        The change of each domain is affine. A cell takes the mean of its pieces, and a node the mean of its cells, both
-        weighted by volume. In ten load steps of a drained beam, this guess instead of u = 0 reduces the Newton steps
-        from 50 to 33, and the tangents from 30 to 13.
+        They follow the trend, see `Trend.over`. A second substep continues the first one, if its length (s) is > 0; the
+        deviation follows the trend. Domains move affinely. A cell takes the mean of its pieces, a node that of its
+        cells, by volumes. Ten load steps of a drained beam take 50 Newton steps from rest, 29 from this guess.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
-        d, places = grid.dim, pieces.places
-        F, change = points.F[:, :d, :d], state.trend.over(seconds)
-        slope = change[:, :, 1:] @ cofactor(F).swapaxes(1, 2) / determinant(F)[:, None, None]
-        origin = change[:, :, :1] - slope @ points.x[:, :, None]
-        affine = cut.to_cells(np.concatenate([origin, slope], axis=2).reshape(-1, d * (1 + d)))
-        rows = np.concatenate([pieces.volume[None], pieces.volume * affine.T])
+        places, (n, d) = pieces.places, points.x.shape
+        F, ratio = points.F[:, :d, :d], seconds / first if first else 0.0
+        change = state.trend.over(seconds, implicit) - ratio * state.trend.over(first, implicit=True)
+        slope = change[:, d : d + d * d].reshape(n, d, d) @ cofactor(F).swapaxes(1, 2) / determinant(F)[:, None, None]
+        origin = change[:, :d] - (slope @ points.x[:, :, None])[:, :, 0]
+        rows = np.concatenate([origin, slope.reshape(n, d * d), change[:, d + d * d :]], axis=1)
+        rows = pieces.volume * np.concatenate([np.ones((1, len(pieces.volume))), cut.to_cells(rows).T])
         volume, *sums = sum_by(places.slots, rows, len(places.filled))
-        of_cells = np.reshape(sums, (d, 1 + d, -1)).transpose(2, 0, 1)
-        x = grid.node_x[grid.cell_nodes[places.filled]]
-        moved = of_cells[:, None, :, 0] + x @ of_cells[:, :, 1:].swapaxes(1, 2)
-        total, nodes = partial(self._momentum.at_nodes, places.filled), self._momentum.active.now.nodes
-        whole, out = total(volume), np.zeros((len(grid.node_x), d))
-        for axis in range(d):
-            out[nodes, axis] = total(moved[:, :, axis]) / np.where(whole > 0, whole, 1.0)
-        return out.ravel()
+        moved, slope = np.array(sums[:d]), np.reshape(sums[d : d + d * d], (d, d, -1)).transpose(2, 1, 0)
+        moved = moved[:, :, None] + (grid.node_x[grid.cell_nodes[places.filled]] @ slope).transpose(2, 0, 1)
+        whole, *moved = self._momentum.at_nodes(places.filled, [volume[:, None], *moved])
+        out = [(np.array(moved) / np.where(whole > 0, whole, 1.0)).T.ravel()]
+        out[0] += ratio * self._momentum.u.x.array[self._momentum.active.now.dofs]
+        if self._storage is not None:
+            p, p_n = (f.x.array[self._momentum.active.now.cells] for f in (self._storage.p, self._storage.p_n))
+            out.append(p_n + ratio * (p - p_n))
+            out[1][: len(volume)] += sums[-1] / volume  # owned cells come first; Newton's method updates ghosts
+        return out
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures, Pa, at time t, s, up to a constant.

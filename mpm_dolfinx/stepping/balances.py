@@ -79,6 +79,7 @@ class Balances(NamedTuple):
     momentum: MomentumProblem
     storage: StorageProblem | None
     inertia: Inertia | None = None
+    ahead: Callable[[], list[NDArray[np.float64]]] | None = None  # see `Motion.ahead`; None without a trend
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
         """Return the velocities at the end of a solved substep; None without inertia; dt: length of the step, s."""
@@ -148,8 +149,6 @@ def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] 
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
         return substep.end / substep.own * scene.momentum.u.x.array
-    if start.state.trend is not None and not leads(scene, acting.loads):
-        return scene.motion.ahead(start.on_grid, start.state, float(substep.end * start.dt))
     velocity = start.state.velocity if substep.before == 0.0 else None
     return None if velocity is None else substep.end * start.dt * velocity
 
@@ -185,8 +184,11 @@ def balances(
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)
+    follows = start.state.trend is not None and not leads(scene, acting.loads)
+    times = float(substep.end * dt), float(substep.own * dt) if substep.before else 0.0, substep.end < 1
+    ahead = partial(scene.motion.ahead, on_grid, start.state, *times) if follows else None
     if scene.storage is None:
-        return Balances(momentum, None, inertia)
+        return Balances(momentum, None, inertia, ahead)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
     fed = matrices.flow(start.state, weight, start.data, acting.t, dt)
     lost = before and before.integrated(substep.before * dt)
@@ -194,7 +196,7 @@ def balances(
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     pushed = None if inertia is None else partial(pushed_back, scene, on_grid)
     storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed, on_grid.scale)
-    return Balances(momentum, storage, inertia)
+    return Balances(momentum, storage, inertia, ahead)
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:

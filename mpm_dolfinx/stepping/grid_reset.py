@@ -276,7 +276,7 @@ class OnGrid(Keyed):
         origin = np.stack([contents.total(weight * x) / total for x in offset.T], axis=1)
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
-        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
+        rise, here = np.add.reduce(slope[at] * (offset - origin[at]), axis=1), seen.p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be inclined to their cells
         pi = here[at] + share[at] * rise
         slope, bounds = (slope * share[:, None])[at], bounds[at]
@@ -570,7 +570,7 @@ class Assembled(Keyed):
         for one in loads:
             of_cells = one.rounding(of_cells)
         own = cells[cells < grid.num_owned]
-        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # cells at a node of a flat side
+        at_nodes = momentum.at_nodes(own, [of_cells[own, None]])[0] / 2 ** (grid.dim - 1)  # cells at a flat side
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(

@@ -91,12 +91,12 @@ class Stay:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Motion of the points in the last step or two.
+    """Motion of the points in the last steps, three at most.
 
     lengths : (k,)
         Lengths of the steps, s, the last one first.
-    rates : (n, k, d, 1 + d)
-        Mean rates of x, m/s, and of F, 1/s, in each of these steps.
+    rates : (n, k, d (1 + d)), with fluid (n, k, d (1 + d) + 1)
+        Mean rates of x, m/s, of F, 1/s, and with fluid of the pressure, Pa/s, in each of these steps.
     """
 
     lengths: NDArray[np.float64]
@@ -105,12 +105,12 @@ class Trend:
     def __post_init__(self):
         _freeze(vars(self))
 
-    def over(self, seconds: float) -> NDArray[np.float64]:
-        """Return changes (n, d, 1 + d) of x, m, and F in a time, s: extrapolated parabola through the last states."""
-        rate = self.rates[:, 0]
-        if len(self.lengths) > 1:
-            rate = rate + (seconds + self.lengths[0]) / self.lengths.sum() * (rate - self.rates[:, 1])
-        return seconds * rate
+    def over(self, seconds: float, implicit: bool = False) -> NDArray[np.float64]:
+        """Return changes (n, ...) in a time (s), by the polynomial through the last states; implicit: as by Euler."""
+        order = np.arange(1, len(self.lengths) + 1)
+        ends = -self.lengths.cumsum()[:, None] / self.lengths[0]
+        shares = np.linalg.solve((ends**order).T, (seconds / self.lengths[0]) ** order * (order if implicit else 1))
+        return np.tensordot(self.rates, -self.lengths * shares[::-1].cumsum()[::-1], (1, 0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,7 +148,7 @@ class State:
         Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
         or contact. None before the first step, and without yield or contact.
     trend
-        Motion in the last steps, an initial guess in dry elastic bodies; None in other scenes, and after new bodies.
+        Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after new bodies.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
         forces, after a new stage, and after a reset of the grid.

@@ -57,7 +57,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         acting = start.begun(placed, earlier)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
-        problem = both.momentum, both.storage, partial(on_grid.as_reset, state)
+        problem = both.momentum, both.storage, both.ahead, partial(on_grid.as_reset, state)
         rates.append(solve_substep(start.matrices.solvers, *problem, key, report, kept))
         passed.append(both.passing())
         flights.append(both.flown(flights[-1], acting.substep, dt))
