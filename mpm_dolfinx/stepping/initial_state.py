@@ -397,7 +397,7 @@ def balanced(scene: Scene, state: State) -> State:
                 best = left, count, points, held, w, problem.outcome()
             if left <= scene.scheme.tolerance:
                 break
-            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
+            solve_substep(solvers, problem, None, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
             for one in problem.loads:
                 seeded = replace(seeded, points=one.gripped(problem.at, seeded.points))
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
