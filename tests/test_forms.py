@@ -204,5 +204,5 @@ def test_moving_the_points_moves_the_form(dim):
 
 
 def test_an_unknown_field_is_named():
-    with pytest.raises(AttributeError, match="carry offset, weight, not 'sigma'"):
+    with pytest.raises(AttributeError, match="have offset, weight, not 'sigma'"):
         _ = FormPoints(GRIDS[2]).sigma

@@ -116,9 +116,9 @@ class MixedCells:
             a, b = (piece[kept][rows] for rows in (one, other))
             overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
             overlap = overlap.clip(0) / np.maximum(high[a] - low[a], NEAR)
-            # deformed boxes may overlap: both count half
-            adjacent = (np.delete(overlap, axis, axis=1) < 0.5).any(axis=1)
-            counted = fraction + sum_by(one, adjacent * fraction[other] * overlap[:, axis], len(lines))
+            # boxes of pieces side by side may overlap after deformation: on a line in both, each counts half
+            lateral = 1 - np.delete(overlap, axis, axis=1).min(axis=1)
+            counted = fraction + sum_by(one, lateral * fraction[other] * overlap[:, axis], len(lines))
             out.append((lines, piece[kept], fraction / np.maximum(counted, 1.0)))
         return out
 
