@@ -2,6 +2,7 @@
 """Bodies from meshes: cells are the points' domains, facets the sides."""
 
 import signal
+from threading import Thread
 
 from mpi4py import MPI
 
@@ -550,6 +551,18 @@ def test_a_polygon_has_the_names_of_its_edges_and_lies_on_others():
     assert areas == pytest.approx({"base": 0, "slope": np.sqrt(2), "crest": 1, "top": 0}, abs=1e-9)
     size = np.sqrt(volumes(slope.corners()) / GRID.cell_volume)
     assert 0.38 < size.mean() < 0.6, "two points a cell and direction"
+
+
+def test_a_polygon_is_filled_in_any_thread():
+    """Only the main thread may set handlers of signals."""
+    grid = mpm.Grid([0, 0], [1, 1], [4, 4])
+    found = []
+    pytest.importorskip("gmsh")
+    corners = [(0.1, 0.1), (0.9, 0.1), (0.5, 0.8)]
+    thread = Thread(target=lambda: found.append(mpm.polygon(grid, corners)))
+    thread.start()
+    thread.join()
+    assert len(found[0]) == len(mpm.polygon(grid, corners))
 
 
 def test_a_polygon_in_national_coordinates_is_filled():

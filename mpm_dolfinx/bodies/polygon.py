@@ -6,6 +6,8 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from inspect import signature
+from threading import current_thread, main_thread
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,6 +136,7 @@ def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
 @contextmanager
 def _gmsh() -> Iterator:
     """Provide gmsh with a separate model.  Afterwards restore the user's gmsh state and handler of Ctrl-C."""
+    main = current_thread() is main_thread()  # other threads may not set handlers
     handler = signal.getsignal(signal.SIGINT)
     try:
         import gmsh
@@ -147,7 +150,8 @@ def _gmsh() -> Iterator:
             verbosity = gmsh.option.getNumber("General.Terminal")
             gmsh.option.setNumber("General.Terminal", 0)  # hides the message about the second initialisation
     if not running:
-        gmsh.initialize()
+        interruptible = {"interruptible": main} if "interruptible" in signature(gmsh.initialize).parameters else {}
+        gmsh.initialize(**interruptible)
     before = gmsh.model.getCurrent()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -159,7 +163,7 @@ def _gmsh() -> Iterator:
         gmsh.option.setNumber("General.Terminal", verbosity)
         if reports and not running:
             gmsh.finalize()
-        if handler is not None:
+        if main and handler is not None:
             signal.signal(signal.SIGINT, handler)
 
 
