@@ -559,10 +559,10 @@ def test_a_polygon_is_filled_in_any_thread():
     found = []
     pytest.importorskip("gmsh")
     corners = [(0.1, 0.1), (0.9, 0.1), (0.5, 0.8)]
-    thread = Thread(target=lambda: found.append(mpm.polygon(grid, corners)))
+    thread = Thread(target=lambda: found.append(mpm.polygon(grid, corners, ["edge"] * 3)))
     thread.start()
     thread.join()
-    assert len(found[0]) == len(mpm.polygon(grid, corners))
+    assert len(found[0]) == len(mpm.polygon(grid, corners, ["edge"] * 3))
 
 
 def test_a_polygon_in_national_coordinates_is_filled():
