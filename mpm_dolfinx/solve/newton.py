@@ -137,8 +137,6 @@ def solve_substep(
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual shows a failed solve
         errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves, ahead if follows else None)
         took = newton.report
-        if took.newton and storage is None and solvers.plan.symmetric and not solvers.plan.iterative:
-            newton.check_stable()
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
     count, most = (took.coupling, "coupling") if in_turn else (took.newton, "newton")
@@ -222,11 +220,11 @@ class Newton:
         fresh = self._linear or not serves
         if other is not None:
             try:
-                return self._iterations(errors, as_reset, key, fresh)
+                return self._stable(self._iterations(errors, as_reset, key, fresh))
             except NotConverged:
                 self._go_to(other)
                 errors, fresh = self._errors(errors.start), True
-        return self._iterations(errors, as_reset, key, fresh)
+        return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
         """Iterate from the present (u, p) with the given errors; fresh: whether to start with a new tangent."""
@@ -340,18 +338,21 @@ class Newton:
             f.x.array[rows] = values
             f.x.scatter_forward()
 
-    def check_stable(self) -> None:
-        """Raise NotConverged at an unstable equilibrium, because smaller steps find the path that leaves it.
+    def _stable(self, found: Errors) -> Errors:
+        """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
         delays buckling. A tangent that is kept for the whole step shows an instability only in the next step. Where
         only soft springs resist a motion, an equilibrium within tolerance may seem unstable, so it is corrected once.
         """
+        plan = self._solvers.plan
+        if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
+            return found
         if not negative_pivots(self._solvers.solve_u):
-            return
+            return found
         self._linearise()  # the last tangent may belong to another state
         if not (count := negative_pivots(self._solvers.solve_u)):
-            return
+            return found
         self._solvers.solve_momentum()
         self._move(-np.ones(self._momentum.system.of_parts.count))
         errors = self._errors()
@@ -359,6 +360,7 @@ class Newton:
         if negative_pivots(self._solvers.solve_u) or errors.worst > self._scheme.tolerance:
             why = f"the equilibrium is unstable, its tangent has {count} negative eigenvalues"
             raise NotConverged(why, self.report.history)
+        return errors
 
     def alternate(self) -> Errors:
         """Solve momentum at fixed pressure and storage at fixed stress in turn, until both converge."""
