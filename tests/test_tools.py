@@ -288,7 +288,7 @@ def shallow(y):
         (lambda: mpm.Tool(mpm.Ball((0, 0), -1)), "radius = -1, must be > 0"),
         (lambda: mpm.Tool(mpm.Ball((0, 0), 1), friction=-0.1), "friction = -0.1, must be >= 0"),
         (lambda: mpm.HalfSpace((0, 0), (0, 0)), "outward = .*, must be a vector"),
-        (lambda: mpm.Convex([(0, 0), (1, 1), (2, 2)]), "corners = .*must be at least"),
+        (lambda: mpm.Convex([(0, 0), (1, 1), (2, 2)]), "corners = .*must be 3 or more"),
         (lambda: mpm.Cone((0, 0), (0, 1), 90), "angle_deg = 90, must be in"),
         (lambda: simple(shape=mpm.Ball((0, 0, 0), 1)), "in 3D, must be in 2D"),
         (lambda: simple(tool={"displacement": 1.0}).run(1, 1), "displacement .* must be 2 finite numbers"),

@@ -274,22 +274,18 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors at the starting point: a guess with a smaller residual than the present (u, p), if any.
 
-        A Newton step `ahead` must leave a small residual: its square. In dry bodies it must also have less potential
-        energy, because a guess may lie near an unstable equilibrium. Also return the other start, or None.
+        A Newton step `ahead` must leave a small residual: its square. Also return the other start, or None.
         """
-        start, rest, rises = self._iterate(), None, None
+        start = self._iterate()
         if ahead is not None:
-            if self._storage is None:
-                rest = self._errors()
-                rises = self._rises()
             u, *p = ahead()
             self._go_to([self._momentum.freely(u), *p])
-            errors, _ = self._tried(rest)
+            errors, _ = self._tried(None)
             worst = np.inf if errors is None else errors.worst
             if errors is not None and errors.fluid is not None:  # without flow, wrong volumes look like exchanged fluid
                 flows = np.abs(self._storage.net_inflow(errors.fluid.rates)).sum()
                 worst = max(worst, errors.fluid.off.sum() / over_all(self._solvers.du.comm.tompi4py(), flows))
-            if worst**2 <= self._solvers.plan.keep and not (rises and rises()):
+            if worst**2 <= self._solvers.plan.keep:
                 return errors, start
             self._go_to(start)
             self.report.history.clear()
@@ -312,15 +308,6 @@ class Newton:
             self._go_to([at, *start[1:]])
             found = self._errors(errors.start)
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
-
-    def _rises(self) -> Callable[[], bool]:
-        """Return a function: whether the u of its call has more potential energy than the present u in some part.
-
-        The difference is the work of the residuals, by the trapezoidal rule. Residuals must be assembled at both u.
-        """
-        system = self._momentum.system
-        r, u = system.residual.array_r.copy(), system.step.array_r.copy()
-        return lambda: bool((system.of_parts.sums((system.residual.array_r + r) * (system.step.array_r - u)) > 0).any())
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
