@@ -1,15 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Tests import the demos' scenes."""
 
-import signal
 import sys
 from pathlib import Path
-from threading import current_thread, main_thread
 
 import pytest
-
-if current_thread() is not main_thread():  # where execnet may run a worker: gmsh sets a handler as it is imported
-    signal.signal = lambda number, _: signal.getsignal(number)
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
 
