@@ -29,9 +29,7 @@ class Parts:
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the largest values (count, ...) in each part, of values (n, ...) in parts (n,); else -inf."""
-        out = np.full((self.count, *values.shape[1:]), -np.inf)
-        np.maximum.at(out, part, values)
-        return over_all(comm, out, MPI.MAX)
+        return largest_of_parts(comm, part, values, self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +67,23 @@ class OfParts:
         return self.sums(np.ones(len(self.of)))
 
 
+def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
+    """Return the largest of the values (n, ...) in each part (count, ...), over all processes; part (n,), from 0."""
+    out = np.full((count, *values.shape[1:]), -np.inf)
+    np.maximum.at(out, part, values)
+    return over_all(comm, out, MPI.MAX)
+
+
 def largest_of_bodies(
     comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
 
-    part (m,): connected part, from 0, of each column of the values (k, m); inside (bodies, parts): whether this process
-    has points of the body in the part.
+    part (m,): of each column of values (k, m), from 0; inside (bodies, parts): whether the body has points here.
     """
-    largest = np.full((len(values), inside.shape[1]), -np.inf)
-    for row, found in zip(values, largest, strict=True):
-        np.maximum.at(found, part, row)
-    together = over_all(comm, np.concatenate([largest, inside]), MPI.MAX)
-    largest, inside = together[: len(values), None], together[len(values) :] > 0
-    found = np.where(inside, largest, -np.inf).max(axis=2, initial=-np.inf)
-    return np.where(inside.any(axis=1), found, 0.0)
+    largest = largest_of_parts(comm, part, values.T, inside.shape[1]).T[:, None]
+    inside = over_all(comm, inside.astype(int), MPI.MAX) > 0
+    return np.where(inside.any(axis=1), np.where(inside, largest, -np.inf).max(axis=2, initial=-np.inf), 0.0)
 
 
 def relative(
