@@ -296,7 +296,7 @@ class HoldLoads(Loads):
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
         self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
-        self._lacked: float | NDArray[np.float64] = np.inf  # mean gaps of sides of each part before the last update
+        self._lacked = np.full(1, np.inf)  # for sides of each part: what `augment` has found, infinite at first
 
     def augment(self, at: At) -> bool:
         """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
@@ -308,9 +308,8 @@ class HoldLoads(Loads):
         if not self._place.dt:
             return False
         means, axis = self.row < self.held.limit.shape[1], self.data["direction"].argmax(axis=1)
-        parts = at.parts
-        side = (self._d * self.held.number[self.row] + axis) * parts.count + parts.cells[self.data.cells]
-        count = len(self._acting.held) * self._d * parts.count
+        side = (self._d * self.held.number[self.row] + axis) * at.parts.count + at.parts.cells[self.data.cells]
+        count = len(self._acting.held) * self._d * at.parts.count
         weight = np.where(means, self.data["stiffness"][:, 0], 0.0)
         gap = np.where(means, self._asked - self._along(at.nodal), 0.0)
         ways = gap, np.abs(self.held.way[self.row, axis])

@@ -63,8 +63,7 @@ class LocalFit:
         basis = np.stack([offset[:, list(p)].prod(axis=1) for p in self._powers], axis=1)
         rows = np.concatenate([basis, values], axis=1)
         outer = (weight[:, None] * basis)[:, :, None] * rows[:, None, :]
-        for k, column in enumerate(outer.reshape(len(at), self._sums.shape[1]).T):
-            self._sums[:, k] += sum_by(at, column, len(self._sums))
+        self._sums += sum_by(at, outer.reshape(len(at), self._sums.shape[1]).T, len(self._sums)).T
 
     def values(self, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the fitted values (count, width) at the positions, on every process; zero without data."""

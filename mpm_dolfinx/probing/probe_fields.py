@@ -147,9 +147,10 @@ class _Around:
         start = np.zeros_like(groups)
         start[:, self._lattice.middle] = True
         reached, passes = start & self._filled, groups | start
+        pairs = [(*pair, passes[:, pair[0]] & self._opening(*side)) for side, pair in self._lattice.neighbours.items()]
         for _ in range(2 * CELLS * self._grid.dim):
-            for (axis, end), (one, other) in self._lattice.neighbours.items():
-                reached[:, other] |= (reached & passes)[:, one] & self._opening(axis, end)
+            for one, other, leads in pairs:
+                reached[:, other] |= reached[:, one] & leads
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
@@ -159,8 +160,7 @@ class _Around:
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the probes; weight (d,): unit weight of the fluid, N/m^3."""
-        comm = self._grid.comm
-        head = self._p - self._centroid @ weight
+        comm, head = self._grid.comm, self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
         rows = [(at, offset, value, share)]
@@ -169,12 +169,11 @@ class _Around:
             rows += [(probe, self._centroid[probe, place], head[probe, place], np.ones(len(probe)))]
             rows += self._outside_faces(head)
         fit = LocalFit(len(base), self._grid.dim, 2)
-        for probe, away, values, part in rows:
-            y = away / self._lattice.size[probe, self._lattice.middle]
-            cells = y
-            if not self._grid.even:
-                cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
-            fit.add(probe, y, (values - base[probe])[:, None], near(cells) * part)
+        probe, away, values, part = map(np.concatenate, zip(*rows, strict=True))
+        y = cells = away / self._lattice.size[probe, self._lattice.middle]
+        if not self._grid.even:
+            cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
+        fit.add(probe, y, (values - base[probe])[:, None], near(cells) * part)
         least, most = (np.full(len(base), start) for start in (np.inf, -np.inf))
         np.minimum.at(least, at[own], value[own])
         np.maximum.at(most, at[own], value[own])
