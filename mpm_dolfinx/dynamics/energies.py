@@ -30,13 +30,13 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 
 
 def initial_energies(
-    materials: SceneMaterials, points: MaterialPoints, kinetic: float
+    materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, from which `after` counts, see `Result.energies`; `internal` is the work of the stresses.
 
-    kinetic: kinetic energy of free tools, J.
+    kinetic: kinetic energy of free tools, J; renews: whether domains may be renewed.
     """
-    works = dict.fromkeys(("internal", "viscous", "friction", "external"), 0.0)
+    works = dict.fromkeys(("internal", "viscous", "friction", "external", *["renewal"] * renews), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)
 
 
@@ -47,17 +47,23 @@ def after(
     kinetic: float,
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
+    lost: Mapping[str, float] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, after a step, from the energies before the step.
 
     kinetic: kinetic energy of free tools, J; seconds: time weights of the substeps, s; powers: powers of the substeps
-    on this process, W, see `MomentumProblem.powers`.
+    on this process, W, see `MomentumProblem.powers`; lost: energies by name, J, that renewal of domains has taken from
+    the bodies at the start of the step.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)
     works = {name: float(before[name]) + more for name, more in work}
     now = stored(materials, points)
     start = before["elastic"] + before["dissipated"] - before["internal"]
+    if lost is not None:
+        start -= lost["elastic"]
+    if lost is not None or "renewal" in before:
+        works["renewal"] = float(before.get("renewal", 0.0)) + sum((lost or {}).values())
     return _named(now, works, start + works["internal"] - now["elastic"], kinetic)
 
 

@@ -238,7 +238,6 @@ class Scene:
             "is axisymmetric": grid.axisymmetric,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
-            "has inertia": self.momentum.inertia is not None,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }
