@@ -296,22 +296,24 @@ class HoldLoads(Loads):
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
         self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
-        self._lacked = np.full(len(acting.held) * self._d, np.inf)
+        self._lacked = np.full(1, np.inf)  # for sides of each part: what `augment` has found, infinite at first
 
     def augment(self, at: At) -> bool:
         """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
 
         A body such as one of sealed water resists the side's motion more stiffly than a single cell would.  The updates
-        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.
+        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.  Means are
+        over the faces of each connected part of the bodies.
         """
         if not self._place.dt:
             return False
         means, axis = self.row < self.held.limit.shape[1], self.data["direction"].argmax(axis=1)
-        side = self._d * self.held.number[self.row] + axis
+        side = (self._d * self.held.number[self.row] + axis) * at.parts.count + at.parts.cells[self.data.cells]
+        count = len(self._acting.held) * self._d * at.parts.count
         weight = np.where(means, self.data["stiffness"][:, 0], 0.0)
         gap = np.where(means, self._asked - self._along(at.nodal), 0.0)
         ways = gap, np.abs(self.held.way[self.row, axis])
-        sums = np.stack([sum_by(side, weight * way, len(self._lacked)) for way in ways])
+        sums = np.stack([sum_by(side, weight * way, count) for way in ways])
         lacks, goes = np.abs(over_all(self.data.points.grid.comm, sums))
         least = np.where(np.isinf(self._lacked), 1 / HOLD, NEAR)
         more = (least * goes < lacks) & (lacks < self._lacked / 2) & (goes > 0)
