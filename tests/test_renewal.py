@@ -126,9 +126,9 @@ def test_a_thousand_renewals_keep_what_a_body_holds(monkeypatch):
 
 def momenta(s, points):
     """Return mass and momentum (3,), angular momentum, the centre of mass (2,), and the kinetic energy."""
-    pieces, of = cut(s.grid, points.corners, second=True), renewal.Renewal(s.bodies, s.scene.materials)
+    pieces, density = cut(s.grid, points.corners, second=True), s.scene.materials.present_density(points)
     at, L = pieces.point, velocity_gradients(points)
-    m, x = pieces.fraction * of._masses(points)[at], pieces.x
+    m, x = pieces.fraction * (density * points.volume0 * points.J)[at], pieces.x
     v = points.data["velocity"][at] + np.einsum("nij,nj->ni", L[at], x - points.x[at])
     turning = L[at] @ pieces.second
     spin = x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0] + turning[:, 1, 0] - turning[:, 0, 1]

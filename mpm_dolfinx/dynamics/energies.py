@@ -47,24 +47,31 @@ def after(
     kinetic: float,
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
-    lost: Mapping[str, float] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, after a step, from the energies before the step.
 
     kinetic: kinetic energy of free tools, J; seconds: time weights of the substeps, s; powers: powers of the substeps
-    on this process, W, see `MomentumProblem.powers`; lost: energies by name, J, that renewal of domains has taken from
-    the bodies at the start of the step.
+    on this process, W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)
     works = {name: float(before[name]) + more for name, more in work}
     now = stored(materials, points)
     start = before["elastic"] + before["dissipated"] - before["internal"]
-    if lost is not None:
-        start -= lost["elastic"]
-    if lost is not None or "renewal" in before:
-        works["renewal"] = float(before.get("renewal", 0.0)) + sum((lost or {}).values())
+    works |= {name: float(before[name]) for name in ("renewal",) if name in before}
     return _named(now, works, start + works["internal"] - now["elastic"], kinetic)
+
+
+def after_renewal(
+    materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
+) -> Mapping[str, NDArray[np.float64]]:
+    """Return the energies, J, after renewal of particle domains, from those before; `renewal` is the loss."""
+    if not renewed:
+        return energy
+    now = stored(materials, new)
+    change = {name: now[name] - value for name, value in stored(materials, old).items()}
+    change["renewal"] = -sum(change.values())
+    return {**energy, **{name: energy.get(name, 0.0) + value for name, value in change.items()}}
 
 
 def _named(

@@ -46,7 +46,6 @@ class Start(NamedTuple):
     yielded: bool  # whether soil has yielded before, on any process
     acting: list[Acting]  # loads of each substep
     renewed: int = 0  # number of renewed particle domains
-    lost: Mapping[str, float] | None = None  # energies that renewal has taken from the bodies, J, if they are recorded
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
         """Return the loads at the beginning of a substep; earlier: data of the loads from the previous substep."""

@@ -31,17 +31,16 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import pressure_of
-from mpm_dolfinx.base.tolerances import SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
+from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
 from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.mechanics.inertia import RATE, VELOCITY, velocity_gradients
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.cutting import Pieces, centroids, cut, volumes
+from mpm_dolfinx.points.cutting import centroids, volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
 from mpm_dolfinx.stepping.state import State, Stay
 
@@ -136,14 +135,17 @@ class Renewal:
         held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
         signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
-        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, VELOCITY in points.data)
+        moves = MOTION[0] in points.data
+        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders]
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, touched)
-        if VELOCITY in points.data:
-            made = self._moving(points, work, made, group)
+        if moves:
+            masses = tuple(self._materials.present_density(of) * of.volume0 * of.J for of in (points, made))
+            v, L = velocities(work, made.corners, made.x, group, masses)
+            made = replace(made, data={**made.data, **dict(zip(MOTION, (v, L @ made.F), strict=True))})
         kept = ~work.affected
         replaced = points.id[work.affected]
         stay, pieces = state.stay, state.pieces
@@ -237,11 +239,8 @@ class Renewal:
 
         like = np.exp(mean(np.log(J)))
         volume0, volume = (size / one / sum_by(group, size / one, count)[group] for one in (like, 1.0))
-        if VELOCITY in points.data:
-            cells, inside = int(work.chosen.sum()), group < work.chosen.sum()  # remainders keep their centres anyway
-            for of, values in ((mass, volume0), (mass * J, volume)):
-                centre = _centre(groups, part * of[source], work.pieces.x[piece], count)[:cells]
-                values[inside] = _centred(group[inside], values[inside], x[inside], centre)
+        if work.pieces.second.size:
+            volume0, volume = (centred(work, group, x, *of) for of in ((volume0, mass), (volume, mass * J)))
         volume0, volume = M[group] * volume0, V[group] * volume  # mass and volume are both exact
         ratio = volume / volume0
 
@@ -275,7 +274,7 @@ class Renewal:
                 data[name] = work.on_faces(values, corners, parent, group, points)
             elif name == ACROSS:
                 data[name] = across
-            elif name not in (PARENT, AREA, ENDS, VELOCITY, RATE, "plastic"):
+            elif name not in (PARENT, AREA, ENDS, *MOTION, "plastic"):
                 data[name] = kept(values)
         data |= {PARENT: parent, AREA: area, ENDS: ends}
         used = points.id[points.id >= self._starts[-1]]
@@ -293,93 +292,10 @@ class Renewal:
             data=data,
         )
 
-    def _moving(
-        self, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray[np.int64]
-    ) -> MaterialPoints:
-        """Return new points `made` with velocities: means of the old affine fields over the overlap, corrected.
-
-        The correction is a rigid motion of each group (m,), which restores its momentum and angular momentum.
-        """
-        count = int(group.max()) + 1
-        piece, groups, share = work.into
-        v, L, mass = points.data[VELOCITY], velocity_gradients(points), self._masses(points)
-        P, old = _moments(work.pieces, piece, groups, share * mass[work.pieces.point[piece]], v, L, count)[:2]
-
-        of, at, part = work.pairs(made.corners, group)
-        weight = part * mass[of]
-        weight = weight / sum_by(at, weight, len(made))[at]
-        fields = v[of] + np.einsum("nij,nj->ni", L[of], made.x[at] - points.x[of]), L[of].reshape(-1, 4)
-        v, L = (np.stack([sum_by(at, weight * column, len(made)) for column in of.T], axis=1) for of in fields)
-        L = L.reshape(-1, 2, 2)
-
-        pieces, mass = cut(self._grid, made.corners, second=True), self._masses(made)
-        rows = np.arange(len(pieces.point))
-        at, inside = group[pieces.point], pieces.fraction * mass[pieces.point]
-        has, now, centre, spread = _moments(pieces, rows, at, inside, v, L, count)
-        spin = ((old - now) / spread)[group]
-        off = made.x - centre[group]
-        v = v + ((P - has) / sum_by(at, inside, count)[:, None])[group]
-        v = v + spin[:, None] * np.stack([-off[:, 1], off[:, 0]], axis=1)
-        turn = spin[:, None, None] * [[0.0, -1.0], [1.0, 0.0]]
-        return replace(made, data={**made.data, VELOCITY: v, RATE: (L + turn) @ made.F})
-
-    def _masses(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the masses (n,), kg, of points with their pore water."""
-        return self._materials.present_density(points) * points.volume0 * points.J
-
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points with indices `rows`."""
         F = unstretched(points.F_of_laws[rows])
         return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
-
-
-def _centre(group: NDArray[np.int64], mass: NDArray[np.float64], x: NDArray, count: int) -> NDArray[np.float64]:
-    """Return the centres (count, 2), m, of masses (m,) at x (m, 2), m, in each group (m,); or means of other values."""
-    whole = np.maximum(sum_by(group, mass, count), TINY)
-    return np.stack([sum_by(group, mass * column, count) for column in x.T], axis=1) / whole[:, None]
-
-
-def _centred(group: NDArray[np.int64], mass: NDArray[np.float64], x: NDArray, centre: NDArray) -> NDArray[np.float64]:
-    """Return masses (m,) at x (m, 2), m, shifted within each group (m,) so that their centres are `centre`, m.
-
-    A mass at most halves; then the centre is missed.
-    """
-    count = len(centre)
-    now = _centre(group, mass, x, count)
-    off = x - now[group]
-    spread = np.stack(
-        [sum_by(group, mass * a * b, count) / sum_by(group, mass, count) for a in off.T for b in off.T], axis=1
-    )
-    slope = np.einsum("nij,nj->ni", np.linalg.pinv(spread.reshape(-1, 2, 2), SAME, hermitian=True), centre - now)
-    more = np.einsum("ni,ni->n", slope[group], off)
-    most = np.zeros(count)
-    np.maximum.at(most, group, np.abs(more))
-    return mass * (1 + more / np.maximum(1.0, 2 * most)[group])
-
-
-def _moments(
-    pieces: Pieces,
-    piece: NDArray[np.int64],
-    group: NDArray[np.int64],
-    mass: NDArray[np.float64],
-    v: NDArray[np.float64],
-    L: NDArray[np.float64],
-    count: int,
-) -> tuple[NDArray[np.float64], ...]:
-    """Return momenta (count, 2), spins (count,), kg m^2/s, centres (count, 2), m, and moments of inertia, by group.
-
-    Spins are angular momenta about the centres.  piece (m,): indices in `pieces`; group (m,): group of each; mass (m,),
-    kg; v (n, 2), m/s, L (n, 2, 2), 1/s: velocities and velocity gradients of the domains.
-    """
-    of, at, second = pieces.point[piece], pieces.x[piece], pieces.second[piece]
-    middle = _centre(of, mass, at, len(v))
-    velocity = v[of] + np.einsum("nij,nj->ni", L[of], at - middle[of])
-    centre, mean = (_centre(group, mass, values, count) for values in (at, velocity))
-    off, slip, turning = at - centre[group], velocity - mean[group], L[of] @ second
-    spin = off[:, 0] * slip[:, 1] - off[:, 1] * slip[:, 0] + turning[:, 1, 0] - turning[:, 0, 1]
-    inertia = (off**2).sum(axis=1) + second[:, 0, 0] + second[:, 1, 1]
-    whole = sum_by(group, mass, count)
-    return mean * whole[:, None], sum_by(group, mass * spin, count), centre, sum_by(group, mass * inertia, count)
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:

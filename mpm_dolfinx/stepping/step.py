@@ -10,7 +10,7 @@ import numpy as np
 
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.conditions.acting import Place
-from mpm_dolfinx.dynamics.energies import after, stored
+from mpm_dolfinx.dynamics.energies import after, after_renewal
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
 from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, leads, left
@@ -27,12 +27,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
     if dt > 0:
         scene.look_at([start, *gravity])
-    old = scene.followed(state)
-    state, renewed = scene.for_reset(old, dt > 0)
-    lost = None
-    if renewed and "energy" in state.outcome:
-        before, after_it = (stored(scene.materials, of.points) for of in (old, state))
-        lost = {name: float(value - after_it[name]) for name, value in before.items()}
+    state, renewed = scene.for_reset(scene.followed(state), dt > 0)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all faces are cut together
@@ -47,7 +42,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     scene.momentum.u.x.array[scene.momentum.active.now.dofs] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
-    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed, lost)
+    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed)
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
@@ -55,8 +50,8 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
-    state, earlier = start.state, None
-    on_grid = start.on_grid
+    before, state = state, start.state
+    on_grid, earlier = start.on_grid, None
     flights, found = [flight_of(start)], []
     for placed in start.acting:
         acting = start.begun(placed, earlier)
@@ -80,7 +75,6 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
     now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
-        kinetic = state.stage.kinetic(outcome)
-        works = kinetic, seconds, found, start.lost
-        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], *works)
+        energy = after_renewal(scene.materials, before.outcome["energy"], before.points, state.points, start.renewed)
+        outcome["energy"] = after(energy, scene.materials, now["points"], state.stage.kinetic(outcome), seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
