@@ -261,6 +261,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         partial(plastic, law=mpm.DruckerPrager),
     ),
     "kept volumes": (partial(yielded, keep_volumes=False), yielded),
+    "renewal that renews nothing": (yielded, partial(yielded, renewal=True)),
     "Mohr-Coulomb instead of Drucker-Prager": (
         partial(plastic, law=mpm.DruckerPrager),
         partial(plastic, law=mpm.MohrCoulomb),
@@ -357,6 +358,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
     parser.add_argument("--quick", action="store_true", help="one pair of small blocks, one turn")
+    parser.add_argument("--only", nargs="+", choices=list(PAIRS), metavar="FEATURE", help="rows of these features only")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # index in MAKES
     o = parser.parse_args(argv)
     if min(o.cells, o.repeat) < 1:
@@ -370,7 +372,7 @@ def main(argv: list[str] | None = None) -> dict:
         lines = [common.markdown([[*head, "MB more", "settlement"]])]
         print(lines[0], flush=True)
         out |= {"cells": cells, "pairs": {}}
-        for name in QUICK if o.quick else PAIRS:
+        for name in o.only or (QUICK if o.quick else PAIRS):
             out["pairs"][name] = measure(name, cells, repeat)
             lines.append(line(name, out["pairs"][name]))
             print(lines[-1], flush=True)

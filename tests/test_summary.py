@@ -117,6 +117,7 @@ BENCHMARK = {
     "mean dilatation": DILATION,
     "plastic law, with mean dilatation": {"state of the law", "kept volumes"} | DILATION,
     "kept volumes": {"kept volumes"},
+    "renewal that renews nothing": set(),
     "finite strain": {"one factorisation for many steps"},
     "factors of a linear law in each step": {"one factorisation for many steps"},
     "files of each step": set(),
