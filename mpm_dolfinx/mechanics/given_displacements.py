@@ -19,7 +19,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.errors import CannotFollow
 from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
@@ -220,18 +220,22 @@ class GivenDisplacements(Acting):
             self._warned.add((number, what))
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise NotConverged if all points of a side follow less than half of their prescribed increment."""
+        """Raise CannotFollow if all points of a side follow less than half of their prescribed increment."""
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
-            old, new, way = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            moves = way > NEAR * self._grid.least
-            came = 1 - ((new - old)[moves] / way[moves]).min(initial=np.inf)
-            came = over_all(self._grid.comm, float(came), MPI.MAX)
-            if -np.inf < came < 0.5:  # less than half of the increment
-                what = f"{line(hold)}: the bodies follow at most {max(0.0, came):.0%} of the prescribed increment"
-                raise NotConverged(f"{what}, must be free to move: undrained pores keep their water")
+            old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
+            if place.begins:  # a value that does not begin at the present position, by more than penalties give way
+                jump = np.linalg.norm((p.origin(before) + end - p.now(before))[:, axes], axis=1)
+                sudden = HOLD * jump > self._grid.least
+                old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)
+            moves = increment > NEAR * self._grid.least
+            share = 1 - ((new - old)[moves] / increment[moves]).min(initial=np.inf)
+            share = over_all(self._grid.comm, float(share), MPI.MAX)
+            if -np.inf < share < 0.5:  # less than half of the increment
+                what = f"{line(hold)}: the bodies follow at most {max(0.0, share):.0%} of the prescribed increment"
+                raise CannotFollow(f"{what}, must be free to move: undrained pores keep their water")
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
@@ -393,7 +397,7 @@ class HoldLoads(Loads):
         return of_cells + 4 * EPSILON * grid.reach * held
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise NotConverged if the bodies did not follow the sides."""
+        """Raise CannotFollow if the bodies did not follow the sides."""
         self._acting.check_came(self._place, points, before)
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
