@@ -186,7 +186,7 @@ class Scene:
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        The weight is that in `stage` at the start t, s, of a step; with varying gravity each step resets the grid.
+        Gravity is that of `stage` at the start t, s, of a step.  If it is a function, each step resets the grid.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
