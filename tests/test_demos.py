@@ -43,6 +43,7 @@ QUICK = {
     "cavity": ("--cells 4 --cases well --ratios 2", ["cavity.png"]),
     "indentation": ("--cells 6", ["indentation.png"]),
     "penetration": ("--cells 4 --rough 0.5 --depth 0.1 --wet-depth 0.05", ["penetration.png"]),
+    "cone": ("--cells 2 --depth 0.5 --wet-depth 2", ["cone.png"]),
     "retaining_wall": ("--cells 6 --delta 0 --ways active", ["retaining_wall.png"]),
     "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
@@ -67,7 +68,7 @@ QUICK = {
 }
 # what they show has tests of its own, or takes long to compile
 LONG = {"slump", "water_table", "cavity", "footing", "slope", "image", "falling", "landslide", "vibration", "wave"}
-LONG |= {"collapse"}
+LONG |= {"collapse", "cone"}
 
 
 def run(demo, arguments):

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: MIT
+"""A cone penetrometer is pushed from the surface into weightless clay, and the pore pressures then dissipate.
+
+The cone has a tip angle of 60 degrees and a roughness of 0.3: its adhesion is 0.3 s_u.  The shaft behind the cone is a
+second tool, which is smooth.  The force on the cone alone is therefore known.  The scene is axisymmetric.  The clay is
+undrained and follows Tresca's law with the strength s_u, or with --mises von Mises's law with this strength in pure
+shear.  Its shear modulus is G = 100 s_u.  The resistance is compared with that of a deep cone in clay with Tresca's law
+and equal initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54),
+
+    N_c = F / (pi R^2 s_u) = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
+
+with the radius R of the shaft and the roughness alpha.
+
+Domains of clay that become longer than a cell are replaced by new domains (renewal).  Without renewal the run ends at a
+depth of two radii.  The shaft and the surface of the clay lie in the middle of cells.  Along a grid line the surface
+would cross cells several times, and renewal does not refill such cells.  The edge between cone and shaft is rounded by
+a cell.
+
+Saturated ("wet") clay is pushed so fast that it is undrained.  Then the cone stops, and the excess pressure at the edge
+between cone and shaft dissipates.  The remaining fraction is compared with the curve of Teh and Houlsby (1991,
+Geotechnique 41), a function of T* = c_v t / (R^2 sqrt(G / s_u)).  That curve is for a deep cone.  Near the surface
+pressures dissipate faster: half at T* = 0.03 and 0.08 with the tip three and five radii deep.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import dataclass, field
+
+import common
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+R, WIDE, BELOW = 1.0, 20.0, 12.0  # m: radius of the shaft and of the clay; clay below the final depth
+STRENGTH, ROUGH, INDEX = 1e3, 0.3, 100.0  # Pa: s_u; adhesion / s_u; G / s_u
+SHEAR = INDEX * STRENGTH
+HALF_ANGLE = 30.0  # degrees, between axis and flank of the cone
+FINE, ABOVE, RATIO = 2.0, 6.5, 1.3  # m: radius of the small cells; cells above the surface; ratio of neighbouring cells
+STEP, WET_STEP = 1 / 6, 1 / 12  # motion of the cone in a step, in cell sizes: undrained and saturated clay
+LAST = 3.0  # radii, over which the steady resistance is averaged
+FAST = 1000.0  # V = v 2 R / c_v, of the push in wet clay
+UNDRAINED = {"bulk": 50 * SHEAR, "shear": SHEAR, "friction": 0.0, "dilation": 0.0, "cohesion": STRENGTH}
+WET = mpm.MohrCoulomb(**UNDRAINED | {"bulk": 2 * SHEAR}, conductivity=1e-9)
+WATER = mpm.Fluid()
+CV = WET.conductivity / WATER.unit_weight * WET.oedometric  # m²/s
+TIMES = np.logspace(-3, 0.2, 25)  # T*, of the outputs while pressures dissipate
+DISSIPATED = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
+TEH = np.array([0.038, 0.078, 0.142, 0.245, 0.439, 0.804, 1.60])
+"""Degree of dissipation at the edge between cone and shaft, and the time factor T*, by Teh and Houlsby (1991)."""
+
+
+def published() -> float:
+    """Return the resistance N_c of a deep cone by Lu et al. (2004)."""
+    return 3.4 + 1.6 * np.log(INDEX) + 1.3 * ROUGH
+
+
+@dataclass
+class Push:
+    """Results of each step: depth / R; N, force on the cone / (pi R^2 s_u).
+
+    frame: final corners (n, 4, 2), m, a field (n,), and the outline of the cone (k, 2), m; seeded: number of points at
+    the start.
+    """
+
+    depth: list[float] = field(default_factory=list)
+    N: list[float] = field(default_factory=list)
+    frame: tuple = ()
+    seeded: int = 0
+    result: mpm.Result | None = None
+
+
+def scene(cells: int, depth: float, clay: mpm.Skeleton, speed: float, end: float, fluid: mpm.Fluid | None):
+    """Return a simulation of the cone on the surface of the clay, and half of its outline (k, 2), m.
+
+    cells: number of whole cells over the radius R, which has half a cell more; depth, m; speed, m/s, until `end`, s.
+    """
+    h = R / (cells + 0.5)
+    low, fine = -(np.ceil(depth / h) + 2 * cells + 0.5) * h, np.ceil(FINE / h) * h
+    zone = [[0, low], [fine, ABOVE * h]]
+    lines = mpm.graded([0, low - BELOW], [WIDE, ABOVE * h], [zone], h, RATIO)
+    grid = mpm.Grid(lines=lines, axisymmetric=True)
+    body = mpm.box(grid, [0, low - BELOW], [WIDE, 0])
+    beta = np.radians(HALF_ANGLE)
+    centre = np.array([R - h, ((R - h) * np.cos(beta) + h) / np.sin(beta)])
+    angle = np.linspace(-beta, 0, 4)
+    edge = centre + h * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    top = depth + 2 * ABOVE * h
+
+    def whole(half) -> np.ndarray:
+        return np.concatenate([half, np.array(half)[::-1] * [-1, 1]])
+
+    def moved(t: float) -> tuple[float, float]:
+        return 0.0, -speed * min(t, end)
+
+    tip = [(0.0, 0.0), *edge]
+    cone = mpm.Tool(mpm.Convex(whole(tip)[1:]), moved, adhesion=ROUGH * STRENGTH, name="cone")
+    shaft = mpm.Tool(mpm.Convex(whole([edge[-1], (R, top)])), moved, name="shaft")
+    acting = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [cone, shaft], "fluid": fluid}
+    if fluid is not None:
+        acting["conditions"] += [mpm.Drained("right")]
+    numerics = mpm.Numerics(renewal=True)
+    return mpm.Simulation(grid, [body], [clay], numerics=numerics, **acting), np.array([*tip, (R, top)])
+
+
+def push(cells: int, depth: float, clay: mpm.Skeleton) -> Push:
+    """Push the cone to `depth`, m, into undrained clay."""
+    out = Push()
+    simulation, outline = scene(cells, depth, clay, 1.0, depth, None)
+    out.seeded = len(simulation.points)
+
+    def see(s: mpm.Simulation) -> None:
+        out.depth.append(s.t / R)
+        out.N.append(-float(s.tool_forces["cone"][1]) / (np.pi * R**2 * STRENGTH))
+
+    out.result = simulation.run(depth, R / (cells + 0.5) * STEP, observe=see, progress=False)
+    points = simulation.points
+    out.frame = points.corners, np.linalg.norm(points.displacement, axis=1) / R, outline - [0, depth]
+    return out
+
+
+@dataclass
+class Dissipation:
+    """Excess pressure / s_u at the edge between cone and shaft, and its remaining fraction at the times T* of `TIMES`.
+
+    frame: corners (n, 4, 2), m, and excess pressures / s_u (n,) when the cone stops, and the outline of the cone, m.
+    """
+
+    N: float = 0.0
+    excess: float = 0.0
+    rest: list[float] = field(default_factory=list)
+    balance: float = 0.0
+    frame: tuple = ()
+
+    def time_of(self, degree: np.ndarray) -> np.ndarray:
+        """Return the time factors T* at which the pressure has dissipated to these degrees."""
+        return np.exp(np.interp(degree, 1 - np.array(self.rest), np.log(TIMES)))
+
+
+def push_wet(cells: int, depth: float) -> Dissipation:
+    """Push the cone to `depth`, m, into saturated clay, then let the pore pressures dissipate."""
+    out = Dissipation()
+    speed = FAST * CV / (2 * R)
+    end = depth / speed
+    simulation, outline = scene(cells, depth, WET, speed, end, WATER)
+    h = R / (cells + 0.5)
+    edge = np.array([R, outline[-2, 1] - depth])
+
+    def excess(s: mpm.Simulation) -> float:
+        """Return the mean pressure / s_u within a cell of the edge."""
+        near = np.linalg.norm(s.points.x - edge, axis=1) < h
+        volume = s.points.volume0[near]
+        return float(volume @ s.points.pressure[near] / volume.sum() / STRENGTH)
+
+    result = simulation.run(end, end / np.ceil(depth / (WET_STEP * h)), progress=False)
+    out.N = -float(simulation.tool_forces["cone"][1]) / (np.pi * R**2 * STRENGTH)
+    out.excess, out.balance = excess(simulation), result.balance
+    out.frame = simulation.points.corners, simulation.points.pressure / STRENGTH, outline - [0, depth]
+
+    def look(s: mpm.Simulation) -> None:
+        out.rest.append(excess(s) / out.excess)
+
+    times = end + TIMES * R**2 * np.sqrt(INDEX) / CV
+    after = simulation.run(times[-1], rtol=2e-2, t_eval=times, observe=look, progress=False)
+    out.balance = max(out.balance, after.balance)
+    return out
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return the results of --json."""
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=2, help="whole cells over the radius, which has half a cell more")
+    parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip / R")
+    parser.add_argument("--wet-depth", type=float, default=5.0, help="depth of the tip / R in saturated clay; 0: none")
+    parser.add_argument("--mises", action="store_true", help="von Mises's law in place of Tresca's, in undrained clay")
+    o = parser.parse_args(argv)
+    if not 2 <= o.cells <= 16 or not 0 < o.depth <= 20:
+        parser.error(f"--cells {o.cells}: must be 2 to 16; --depth {o.depth}: must be in (0, 20]")
+    if o.wet_depth and not 2 <= o.wet_depth <= 20:
+        parser.error(f"--wet-depth {o.wet_depth}: must be 0, or in [2, 20]")
+    clay = (mpm.DruckerPrager if o.mises else mpm.MohrCoulomb)(**UNDRAINED)
+    with common.results(o) as out:
+        run = push(o.cells, o.depth * R, clay)
+        depth, N = np.array(run.depth), np.array(run.N)
+        last = N[depth > o.depth - LAST]
+        out |= {"N": float(last.mean()), "error": float(last.mean() / published() - 1)}
+        thirds = [part.mean() for part in np.array_split(last, 3)]
+        out["drift"] = float((max(thirds) - min(thirds)) / last.mean())
+        out |= {"steps": run.result.steps, "cuts": run.result.cuts, "renewals": run.result.renewals}
+        found = f"N = {last.mean():.2f} in the last {LAST:g} radii, Lu et al. {published():.2f}"
+        found += f"; {run.result.cuts} of {run.result.steps} steps cut"
+        print(f"{found}; {run.result.points} points, {run.seeded} seeded", flush=True)
+        wet = None
+        if o.wet_depth:
+            wet = push_wet(o.cells, o.wet_depth * R)
+            out["wet"] = {"N": wet.N, "excess": wet.excess, "T50": float(wet.time_of(np.array(0.5)))}
+            out["balance"] = wet.balance
+            found = f"wet clay: N = {wet.N:.2f}, excess pressure at the edge {wet.excess:.2f} s_u"
+            print(f"{found}, half dissipated at T* = {out['wet']['T50']:.3f} (Teh and Houlsby {TEH[3]})", flush=True)
+        draw(o, run, wet)
+        out["converged"] = run.result.cuts <= 0.1 * run.result.steps
+    return out
+
+
+def draw(o: Namespace, run: Push, wet: Dissipation | None) -> None:
+    """Draw the resistance, the displacements and, in wet clay, the pore pressures and their dissipation."""
+    fig, axes = common.figure(1, 4, (17, 6))
+    ax = axes[0, 0]
+    ax.plot(run.N, run.depth)
+    ax.axvline(published(), color="k", ls="--", lw=0.8)
+    ax.set(xlabel="F / (π R² s_u) (-)", ylabel="depth / R (-)", title="dashed: Lu et al. (2004)", ylim=(o.depth, 0))
+    show(axes[0, 1], run.frame, o.depth, "displacement / R (-)", "undrained clay", (0, 2))
+    if wet is not None:
+        most = np.abs(wet.frame[1]).max()
+        show(axes[0, 2], wet.frame, o.wet_depth, "excess pore pressure / s_u (-)", "saturated clay", (-most, most))
+        ax = axes[0, 3]
+        ax.semilogx(TIMES, wet.rest, label="computed")
+        ax.semilogx(TEH, 1 - DISSIPATED, "ko", label="Teh and Houlsby (1991)")
+        ax.set(xlabel="T* (-)", ylabel="remaining excess pressure (-)", ylim=(0, None), title="at the edge")
+        ax.legend(fontsize=9)
+    for ax in axes[0, [0, 3]]:
+        ax.grid(alpha=0.3)
+    common.save(fig, o.out / "cone.png", dpi=80)
+
+
+def show(ax, frame: tuple, depth: float, label: str, title: str, clim: tuple[float, float]) -> None:
+    """Draw the clay at a state of the cone, coloured by the field of the frame."""
+    corners, values, outline = frame
+    domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
+    inside = np.concatenate([outline, [[0, outline[-1, 1]]]])
+    ax.fill(*inside.T, facecolor="0.6", edgecolor="0.4")
+    ax.set(aspect="equal", xlim=(0, 5), ylim=(-depth - 2, 1.5), xlabel="r (m)", ylabel="z (m)", title=title)
+    ax.figure.colorbar(domains, ax=ax, label=label, shrink=0.8)
+
+
+if __name__ == "__main__":
+    raise SystemExit(0 if main()["converged"] else 1)
