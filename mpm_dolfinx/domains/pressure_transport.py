@@ -132,12 +132,13 @@ class Reconstruction:
         jump, one_sided, _, drained = self._differences(pressures)
         slope, low, high = van_leer(one_sided), *_bounds_of(jump)
         whole = self.grid.sizes(cells)[..., None] * [-0.5, 0.5]
-        filled = (2 * centroid[cells][:, :, None] - whole[..., ::-1]).clip(whole[..., :1], whole[..., 1:])
+        filled = 2 * centroid[cells][:, :, None] - whole[..., ::-1]
+        filled = np.minimum(np.maximum(filled, whole[..., :1]), whole[..., 1:])
         ends = slope[:, :, None] * (np.where(drained, filled, whole) - origin[:, :, None])
         scale = np.ones(len(cells))
         for end, bound in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
             scale = np.minimum(scale, np.divide(bound, end, out=np.ones(len(cells)), where=end != 0))
-        return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
+        return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return differences and slopes to neighbours and drained sides, and which neighbours and drained sides exist.
@@ -252,8 +253,8 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
     """Return the factor (m,) that keeps corrected pressures within the bounds, equal for all pieces of a domain."""
-    first = np.diff(owner, prepend=-1).nonzero()[0]
+    first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
-    share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0).clip(0, 1)
-    return np.minimum.reduceat(share, np.diff(new.point, prepend=-1).nonzero()[0])[new.point]
+    share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0)
+    return np.minimum.reduceat(np.minimum(np.maximum(share, 0.0), 1.0), new_first)[new.point]

@@ -226,15 +226,16 @@ class CellContents(Keyed):
         centroid, lower, upper = (f.x.array.reshape(-1, d) for f in shapes)
         centroid[filled] = (sums[3 : 3 + d] / area).T - grid.midpoints[filled]
         for target, faces in ((lower, sums[3 + d :: 2]), (upper, sums[4 + d :: 2])):
-            target[filled] = faces.T * grid.sizes(filled) / np.reshape(grid.volumes(filled), (-1, 1))
+            target[filled] = faces.T * grid.sizes(filled) / np.array(grid.volumes(filled)).reshape(-1, 1)
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
         at = grid.midpoints[filled] + centroid[filled]
         self._unit = np.eye(d)
-        self._shapes = np.dstack([grid.shape_gradients(filled, at), grid.shape_values(filled, at)])
+        shapes = [grid.shape_gradients(filled, at), grid.shape_values(filled, at)[:, :, None]]
+        self._shapes = np.concatenate(shapes, axis=2)
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
-        self.open[active] = np.stack([lower[active], upper[active]], axis=2)
+        self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
         """Vectors (c, d), m, from cell midpoints to centroids of material; open fractions (c, d, 2) of faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:

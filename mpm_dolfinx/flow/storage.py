@@ -502,9 +502,10 @@ class StorageProblem:
         between, difference = 0.0, np.zeros(sum(sides))
         if outflow.nonorthogonal is not None:
             between, difference = outflow.nonorthogonal(p, self.forms.bulk)
-        parts = np.split(difference, np.cumsum(sides)[:-1])
-        for one, at, part in zip(self._feeds, outflow.at, parts, strict=False):
-            one.begin(at, fluid, part)
+        start = 0
+        for one, at, count in zip(self._feeds, outflow.at, sides, strict=True):
+            one.begin(at, fluid, difference[start : start + count])
+            start += count
         return between
 
     @property

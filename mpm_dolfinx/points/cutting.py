@@ -132,7 +132,8 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     As in `cut`, inverted simplices count with positive volume.
     """
-    return np.concatenate([_centroids(corners[part]) for part in _chunks(len(corners), corners.shape[2])])
+    chunks = _chunks(len(corners), corners.shape[2])
+    return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
 
 
 def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,6 +176,8 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
     The pieces.  Pieces below 1e-12 of their domain are left out; the fractions of every domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
+    if len(chunks) == 1:
+        return _cut(grid, corners, second, faces)
     parts = [_cut(grid, corners[chunk], second, faces) for chunk in chunks]
     for chunk, part in zip(chunks, parts, strict=True):
         part.point += chunk.start

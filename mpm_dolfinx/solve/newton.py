@@ -95,7 +95,7 @@ class Errors:
     @cached_property
     def worst(self) -> float:
         """The largest residual of all parts."""
-        return float(self.each.max(initial=0.0))
+        return float(np.maximum.reduce(self.each, initial=0.0))
 
 
 def solve_substep(
@@ -412,7 +412,7 @@ class Newton:
         if first and not np.isfinite(norm := r.norm() + size):
             where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
             raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
-        self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
+        self.report.history.append(tuple(float(np.maximum.reduce(of, initial=0.0)) for of in (error_u, error_p)))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:

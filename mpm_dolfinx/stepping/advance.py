@@ -193,8 +193,9 @@ class Motion:
         change, gradient_change = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
         pressure = (points.pressure - state.points.pressure)[:, None] if self._storage is not None else change[:, :0]
         rates = np.concatenate([change, gradient_change, pressure], axis=1)[:, None] / dt
-        lengths, past = ([], rates[:, :0]) if before is None else (before.lengths[:2], before.rates[:, :2])
-        return Trend(np.append(dt, lengths), np.concatenate([rates, past], axis=1))
+        if before is None:
+            return Trend(np.array([dt]), rates)
+        return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
         """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
@@ -207,13 +208,14 @@ class Motion:
         grid, pieces = cut.grid, on_grid.data.pieces
         places, (n, d) = pieces.places, points.x.shape
         F, ratio = points.F[:, :d, :d], seconds / first if first else 0.0
-        change = state.trend.over(seconds, implicit) - ratio * state.trend.over(first, implicit=True)
+        change = state.trend.over(seconds, implicit, first)
         slope = change[:, d : d + d * d].reshape(n, d, d) @ cofactor(F).swapaxes(1, 2) / determinant(F)[:, None, None]
         origin = change[:, :d] - (slope @ points.x[:, :, None])[:, :, 0]
         rows = np.concatenate([origin, slope.reshape(n, d * d), change[:, d + d * d :]], axis=1)
-        rows = pieces.volume * np.concatenate([np.ones((1, len(pieces.volume))), cut.to_cells(rows).T])
-        volume, *sums = sum_by(places.slots, rows, len(places.filled))
-        moved, slope = np.array(sums[:d]), np.reshape(sums[d : d + d * d], (d, d, -1)).transpose(2, 1, 0)
+        rows = np.concatenate([pieces.volume[None], pieces.volume * cut.to_cells(rows).T])
+        sums = sum_by(places.slots, rows, len(places.filled))
+        volume, sums = sums[0], sums[1:]
+        moved, slope = sums[:d], sums[d : d + d * d].reshape(d, d, -1).transpose(2, 1, 0)
         moved = moved[:, :, None] + (grid.node_x[grid.cell_nodes[places.filled]] @ slope).transpose(2, 0, 1)
         whole, *moved = self._momentum.at_nodes(places.filled, [volume[:, None], *moved])
         out = [(np.array(moved) / np.where(whole > 0, whole, 1.0)).T.ravel()]
@@ -421,7 +423,7 @@ class Motion:
         self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the weighted mean (count,) of the values of each part's points; zero for parts without points."""
-        sums = np.stack([sum_by(part, column, count) for column in (weight * values, weight)])
+        sums = sum_by(part, np.array([weight * values, weight]), count)
         total, whole = over_all(self._momentum.grid.comm, sums)
         return np.divide(total, whole, out=np.zeros(count), where=whole > 0)
 

@@ -273,7 +273,7 @@ class OnGrid(Keyed):
         store = self.cut.pieces_to_cells(store)
         weight = np.where(contents.total(store)[at] > 0, store, self.weight)
         total = contents.total(weight)
-        origin = np.stack([contents.total(weight * x) / total for x in offset.T], axis=1)
+        origin = (contents.total(weight * offset.T) / total).T
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.add.reduce(slope[at] * (offset - origin[at]), axis=1), seen.p[contents.filled]
