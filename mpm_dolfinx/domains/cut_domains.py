@@ -121,14 +121,18 @@ class CutDomains(Keyed):
         self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
-        self._exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
-        self.cells, self.x = grid.local(self._exchange.send(self.pieces.cell)), self._exchange.send(self.pieces.x)
+        exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        self.pieces_to_cells = exchange.send
+        """Function that sends values of the pieces to the owners of their cells."""
+        self.to_pieces = exchange.back
+        """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
+        self.cells, self.x = grid.local(exchange.send(self.pieces.cell)), exchange.send(self.pieces.x)
         """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
-        self.mixed = self._exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
+        self.mixed = exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """In 3D: mean products of the offsets of the pieces, see `Pieces`."""
-        self.second = self._exchange.send(self.pieces.second) if second else None
+        self.second = exchange.send(self.pieces.second) if second else None
         """If `second`: mean products of all offsets of the pieces (m, d, d), m^2."""
-        self.hoop = self._exchange.send(self.pieces.hoop) if grid.axisymmetric else None
+        self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
@@ -148,15 +152,7 @@ class CutDomains(Keyed):
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells; return values (m, ...)."""
-        return self._exchange.send(values[self.pieces.point])
-
-    def pieces_to_cells(self, values: NDArray) -> NDArray:
-        """Send values of the pieces to the owners of their cells."""
-        return self._exchange.send(values)
-
-    def to_pieces(self, values: NDArray) -> NDArray:
-        """Send values (m, ...) of the pieces from the owners of cells back to the processes of the points."""
-        return self._exchange.back(values)
+        return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections."""

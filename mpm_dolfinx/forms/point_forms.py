@@ -346,7 +346,10 @@ class Rows:
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the current values of the fields that change between assemblies for the same points."""
-        return {name: values(data) for _, name, values in self._changing}
+        out = {}
+        for _, name, values in self._changing:
+            out[name] = values(data)
+        return out
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return a buffer for at least `size` rows.  It is kept between steps, because allocation of memory is slow."""

@@ -210,7 +210,7 @@ def of_cells(name: str) -> cached_property:
 
 def of_places(name: str) -> property:
     """Return a property of a grid that is a current position in its `Cells`."""
-    return property(lambda grid: getattr(grid._of_process.at, name))
+    return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
 def of_spacing(name: str) -> property:

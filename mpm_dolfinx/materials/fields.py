@@ -311,8 +311,9 @@ class SceneMaterials:
         """
         each, shapes = [], set()
         for i in self._used:
-            rows = (points.material == i).nonzero()[0]
-            found = np.asarray(value(self._at(points, i, rows), *[column[rows] for column in columns]))
+            rows = (points.material == i).nonzero()[0] if len(self._used) > 1 else np.arange(len(points.id))
+            at = self._at(points, i, rows) if self._fields[i] else self.materials[i]
+            found = np.asarray(value(at, *[column[rows] for column in columns]) if columns else value(at))
             each.append((rows, found))
             shapes.add(found.shape[bool(columns or self._fields[i]) :])
         out = np.zeros((len(points.id), *(shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes))))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
@@ -166,22 +167,24 @@ class MaterialPoints:
     def __len__(self) -> int:
         return len(self.id)
 
-    @property
+    @cached_property
     def J(self) -> NDArray[np.float64]:
         """Volume ratio det F (n,)."""
-        return determinant(self.F)
+        J = determinant(self.F)
+        J.flags.writeable = False
+        return J
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:
         """Deformation gradient used by laws (n, 3, 3); in plane strain without an out-of-plane stretch (n, 2, 2)."""
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
-    def strained(self, F: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with another deformation gradient F, in the shape of `F_of_laws`."""
+    def strained(self, F: NDArray[np.float64], **others: NDArray[np.float64]) -> MaterialPoints:
+        """Return the points with another F, in the shape of `F_of_laws`, and with other values of the fields `others`."""
         if ACROSS not in self.data:
-            return replace(self, F=F)
+            return replace(self, F=F, **others)
         F, across = in_plane(F)
-        return replace(self, F=F, data={**self.data, ACROSS: across})
+        return replace(self, F=F, data={**self.data, ACROSS: across}, **others)
 
     @property
     def displacement(self) -> NDArray[np.float64]:

@@ -141,7 +141,7 @@ class Motion:
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
-                points = replace(state.points.strained(F), x=x, corners=corners)
+                points = state.points.strained(F, x=x, corners=corners)
                 keeps, folded = on_grid.valid(points, loads), 0
             self._check_volumes(points, cut)
             if carried is not None:
@@ -149,7 +149,8 @@ class Motion:
                 moved = np.where(keeps & stays, 0.0, cut.moved(points, part, count)[part])
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
-            points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
+            if (data_now := self._materials.updated_state(points, state.points, t - state.t)) is not points.data:
+                points = replace(points, data=data_now)
             if self.keeps_volumes:
                 points = self._corrected(points, state, loads, keeps & stays)
             carried = None
@@ -158,18 +159,17 @@ class Motion:
                 x = on_grid.of_pieces(state, "x", cut.pieces.x)
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
-                points = replace(points, pressure=self.pressures(on_grid, state.stage, t, nodal))
-                ids = points.id[cut.pieces.point]
+                ids, defect = points.id[cut.pieces.point], {}
                 of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and net_inflow is not None:
                     defect = self._volume_defect(state, points, on_grid, data.of_points, net_inflow, keeps)
-                    points = replace(points, data=points.data | defect)
+                now = self.pressures(on_grid, state.stage, t, nodal)
+                points = replace(points, pressure=now, data=points.data | defect)
             _check_inside(cut, points, t, report)
         stays = stays and not (self._materials.retentions and callable(state.stage.conditions["gravity"]))
-        stay = Stay(cut.points)
-        trend = self._followed(state, points, t - state.t) if self._trends else None
-        new = replace(state, t=t, points=points, pieces=carried, stay=stay, trend=trend)
+        new = {"t": t, "points": points, "pieces": carried}
+        new["trend"] = self._followed(state, points, t - state.t) if self._trends else None
         keeps = keeps & stays
         again = [not keeps.all()]
         if self._storage is not None:
@@ -178,14 +178,12 @@ class Motion:
         if report is not None:
             report.first = np.multiply(report.first, again)
         if not any(again):
-            return new, folded
-        new = replace(self.left_grid(new, on_grid), held=None, rest=None)
-        if some:
-            kept = {name: self._kept(getattr(state, name), on_grid, keeps) for name in ("held", "rest")}
-            if carried is not None:
-                kept["pieces"] = replace(new.pieces, of_cell=carried.of_cell, start=carried.start)
-            new = replace(new, stay=replace(stay, keeps=keeps), **kept)
-        return new, folded
+            return replace(state, **new, stay=Stay(cut.points)), folded
+        if carried is not None:
+            more = (carried.of_cell, carried.start) if some else (None, None)
+            new["pieces"] = self._left(carried, points, state.stage, t, on_grid, *more)
+        kept = {name: self._kept(getattr(state, name), on_grid, keeps) if some else None for name in ("held", "rest")}
+        return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), folded
 
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
         """Return the trend of the points after a step of dt (s)."""
@@ -348,7 +346,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
+        return points.strained(F, corners=corners, x=centroids(corners)), keeps, folded
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n, 2^d, d) of components of corners: neither prescribed by conditions nor fixed by walls."""
@@ -464,20 +462,34 @@ class Motion:
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state in which points store the pressures of their pieces: the next step resets the grid."""
-        carried, points = state.pieces, state.points
-        if self._storage is not None:
-            with _compat.Timer("remap"):
-                pieces = on_grid.cut.pieces
-                store = self._materials.storage(points) * points.volume0 * points.J
-                on_grid.set_pressures(carried.of_cell)
-                water = on_grid.pore_water(points)
-                at_rest = None if water is None else self._at_rest(state.stage, state.t, None)
-                pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t, water, at_rest
-                )
-                leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": None, "start": None}
-                carried = replace(carried, **leaves)
-        return replace(state, pieces=carried, stay=None)
+        pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid)
+        return replace(state, pieces=pieces, stay=None)
+
+    def _left(
+        self,
+        carried: PiecePressures,
+        points: MaterialPoints,
+        stage: Stage,
+        t: float,
+        on_grid: OnGrid,
+        of_cell: NDArray[np.float64] | None = None,
+        start: NDArray[np.float64] | None = None,
+    ) -> PiecePressures:
+        """Return the pieces to be moved to the next grid, with pressures at their centroids at time t, s.
+
+        of_cell, start: see `PiecePressures`.
+        """
+        with _compat.Timer("remap"):
+            pieces = on_grid.cut.pieces
+            store = self._materials.storage(points) * points.volume0 * points.J
+            on_grid.set_pressures(carried.of_cell)
+            water = on_grid.pore_water(points)
+            at_rest = None if water is None else self._at_rest(stage, t, None)
+            pressure, slope, bounds = on_grid.pressures_at_pieces(
+                self._reconstruction, pieces.fraction * store[pieces.point], stage, t, water, at_rest
+            )
+        leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": of_cell, "start": start}
+        return replace(carried, **leaves)
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
