@@ -183,8 +183,10 @@ def _plain(function: Callable) -> bool:
 
 def _parameters(function: Callable) -> list[Parameter] | None:
     """Return the parameters to which arguments are passed; None if they are unknown."""
-    with suppress(KeyError, TypeError):  # some objects have no hash
+    try:
         return _known[function]
+    except (KeyError, TypeError):  # some objects have no hash
+        pass
     try:
         every = list(signature(function).parameters.values())
     except (TypeError, ValueError):  # some built-in functions

@@ -231,23 +231,20 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     common[match] = np.minimum(new.fraction[match], old.fraction[before])
     left_fraction = old.fraction.copy()
     left_fraction[before] -= common[match]
-    leaving = sum_by(owner, left_fraction, n)
     share = common / new.fraction
-
-    def remapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values of the new pieces: the old value on the common part, else the mean of the parts that left."""
-        mean = np.divide(sum_by(owner, left_fraction * values, n), leaving, out=np.zeros(n), where=leaving > 0)
-        old_values = np.zeros(len(new_key))
-        old_values[match] = values[before]
-        return share * old_values + (1 - share) * mean[new.point]
-
-    pressure = remapped(old.pressure)
-    correction = np.zeros(len(new_key))
-    for axis in range(old.x.shape[1]):
-        slope = sum_by(owner, old.fraction * old.slope[:, axis], n)
-        then = old.x[:, axis] - sum_by(owner, old.fraction * old.x[:, axis], n)[owner]
-        now = new.x[:, axis] - sum_by(new.point, new.fraction * new.x[:, axis], n)[new.point]
-        correction += slope[new.point] * (now - remapped(then))
+    # rows are pressure and centroid; the centroid of a piece is relative to that of its domain
+    sums, d = sum_by(owner, old.fraction * np.concatenate([old.slope, old.x], axis=1).T, n), old.x.shape[1]
+    slope, centre = sums[:d], sums[d:]
+    then = np.concatenate([old.pressure[None], old.x.T - centre[:, owner]])
+    leaving = sum_by(owner, np.concatenate([left_fraction[None], left_fraction * then]), n)
+    mean = np.divide(leaving[1:], leaving[0], out=np.zeros((len(then), n)), where=leaving[0] > 0)
+    # a new piece has the old value on the common part, else the mean of the parts that left
+    values = np.zeros((len(then), len(new_key)))
+    values[:, match] = then[:, before]
+    values = share * values + (1 - share) * mean[:, new.point]
+    pressure = values[0]
+    now = new.x.T - sum_by(new.point, new.fraction * new.x.T, n)[:, new.point]
+    correction = np.add.reduce(slope[:, new.point] * (now - values[1:]))
     return pressure + _limited(correction, pressure, old, owner, new) * correction
 
 

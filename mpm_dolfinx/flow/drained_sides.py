@@ -319,16 +319,16 @@ class SideFeeds(Feeds):
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
         """Return the outflow of the cells.  The non-orthogonal correction is computed at the start of the substep."""
-        flux, counts = self._through(at, fluid), self._counts(at)
+        flux = self._through(at, fluid)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
-        rows = np.array([flux, counts * at.open_by(fluid), np.abs(flux) * self._drain])
+        rows = np.array([flux, self._if_open(at, at.open_by(fluid)), np.abs(flux) * self._drain])
         cells, turnover, gain = sum_by(at.at, rows, len(fluid.pi))
         return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # rain is no gain: steady rain changes no storage
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow by the pressure of the cell."""
-        return sum_by(at.at, self._counts(at) * (1 + self._share) * at.derivative(fluid), len(fluid.pi))
+        return sum_by(at.at, self._if_open(at, (1 + self._share) * at.derivative(fluid)), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
         """Update the active set: seepage faces with outflow become open, others closed; return the count of changes."""
@@ -378,10 +378,10 @@ class SideFeeds(Feeds):
                 out["ponded"][name] = np.array(ponded[i])
         return out
 
-    def _counts(self, at: OpenFaces) -> NDArray[np.bool_]:
-        """Return which faces (m,) are open."""
-        return self._flows | ~at.seeps
+    def _if_open(self, at: OpenFaces, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (m,) of faces, with zeros at closed seepage faces."""
+        return np.where(self._flows | ~at.seeps, values, 0.0) if self.settles else values
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
-        return np.where(self._counts(at), (1 + self._share) * at.outflow(fluid), 0.0) + self._nonorthogonal
+        return self._if_open(at, (1 + self._share) * at.outflow(fluid)) + self._nonorthogonal

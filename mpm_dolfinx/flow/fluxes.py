@@ -452,8 +452,9 @@ class FluxForms:
             moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
             values.append((self.moved, moved if shift is None else moved - shift))
         for f, rows in values:
-            f.x.array.reshape(-1, d)[filled] = rows
-            f.x.scatter_forward()
+            x = f.x
+            x.array.reshape(-1, d)[filled] = rows
+            x.scatter_forward()
         if self.relative is not None:
             self.relative.set_borders(contents, flow, *(f.x.array.reshape(-1, d) for f in (self.centroid, self.moved)))
         return mobility

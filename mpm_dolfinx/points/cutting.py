@@ -231,7 +231,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
         volume = simplex_volumes(v)
     # segments or triangles (d, d, m): vertices and coordinates first, for fast loops in numpy
     s = np.concatenate([v[facet] for facet in _FACETS[d][:, -1]], axis=2)
-    outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), len(_FACETS[d]))
+    outward, owner = _area_vectors(s), np.arange(len(corners))[None].repeat(len(_FACETS[d]), axis=0).ravel()
     # an inverted simplex counts with positive volume: its negative volume is subtracted twice
     simplex, folded = np.nonzero(volume < 0)
     if len(folded):
@@ -279,12 +279,15 @@ class _Slots:
         top = (grid.shape - 1)[:, None]
         self.low = np.minimum(np.maximum(np.floor(y.min(axis=0)).astype(np.int64), 0), top)
         self.high = np.minimum(np.maximum(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low), top)
-        span = self.high - self.low + 1
-        stop = np.cumsum(span.prod(axis=0))
+        self._span = span = self.high - self.low + 1
+        self._stride = np.ones(span.shape, dtype=np.int64)
+        for axis in range(len(span) - 1, 0, -1):
+            self._stride[axis - 1] = self._stride[axis] * span[axis]
+        count = self._stride[0] * span[0]
+        stop = count.cumsum()
         self.size = int(stop[-1]) if len(stop) else 0
-        self.point = np.arange(y.shape[2]).repeat(span.prod(axis=0))
-        self._stride = np.cumprod(np.concatenate([np.ones_like(span[:1]), span[:0:-1]]), axis=0)[::-1]
-        self._start, self._span = stop - span.prod(axis=0), span
+        self.point = np.arange(y.shape[2]).repeat(count)
+        self._start = stop - count
         number = np.arange(self.size) - self._start[self.point]
         self._place = number // self._stride[:, self.point] % span[:, self.point]
         self.cell = self.low[:, self.point] + self._place
@@ -531,10 +534,10 @@ def cut_faces(
         return grid.low + grid.h * y if grid.even else y
 
     points = np.einsum("qk,kam->qam", _RULES[d], s)
-    middle = np.tile(place(s[:, :d].mean(axis=0).T), (len(points), 1))
-    points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
     count = len(_RULES[d])
-    face, share = np.tile(owner, count), np.tile(share / count, count)
+    middle = place(np.add.reduce(s[:, :d]).T / d)[None].repeat(count, axis=0).reshape(-1, d)
+    points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
+    face, share = (rows[None].repeat(count, axis=0).ravel() for rows in (owner, share / count))
     return face, place(points[:, :d]), points[:, d:], share, middle
 
 

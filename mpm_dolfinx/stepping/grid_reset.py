@@ -609,15 +609,16 @@ class Assembled(Keyed):
             together = [grid.comm] if mixture else []  # without pressures the key is equal on all processes
             return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
-        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
-            gradients = None if self._off is None else self._gradients(where, fit)
-            off = gradients and (self._off, gradients, sides)
-            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
-
         def fit() -> Gradients | None:
             needed = self._off.some or off_middle(sides, grid).any()
             return Gradients(contents, sides) if needed else None
+
+        where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
+        gradients = None if self._off is None else self._gradients(where, fit)
+        off = gradients and (self._off, gradients, sides)
+
+        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
+            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
         mixture = ()
         if self._by_pressure is not None:
