@@ -207,9 +207,9 @@ def takes(function: Callable) -> tuple[str, ...] | None:
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
     """Return the arguments of a function with these parameters; see `takes`."""
-    names = ("t",) if parameters is None else tuple([p.name for p in parameters])
-    if len(names) == 1 and names[0] not in PLACES:
+    if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
         return ("t",)
+    names = tuple([p.name for p in parameters])
     if not names or not set(names) <= set(NAMES):
         return None
     return None if names == ("x",) and not _plain(function) else names

@@ -205,11 +205,11 @@ class CutDomains(Keyed):
         places = interpolate(corners.repeat(count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
         outward = face_vectors(corners, number)
-        size = np.linalg.norm(outward, axis=1, keepdims=True)
+        size = np.sqrt(np.add.reduce(outward**2, axis=1, keepdims=True))
         skew = skew[here][face].nonzero()[0]  # over a triangle, positions are linear, but xi is not
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
-        inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros(outward.shape), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.arange(len(several)).repeat(list(map(len, several)))[here][face]

@@ -251,7 +251,7 @@ def filtered(
 
     `then` are the points at the last grid reset.  `free` (n,) tells which points are filtered.
     """
-    out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
+    out, cells = np.zeros(points.corners.shape), crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
         moved = points.corners[rows] - points.reference[rows]

@@ -257,7 +257,7 @@ class SideFeeds(Feeds):
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
-        self._rains = tuple(depth is not None for depth in ponds)
+        self._rains = [depth is not None for depth in ponds]
         self._names, self._before = names, wet.outcome
         self._contents, self._comm = wet.contents, wet.cut.grid.comm
         self._fallen = sides.rain
@@ -266,7 +266,7 @@ class SideFeeds(Feeds):
         self.settles = bool(self._seeps.any())
         self.linear = not any(self._rains)
         self._drain = wet.drains
-        self._flows, self._nonorthogonal = np.ones(len(sides.cells), dtype=bool), 0.0
+        self._flows, self._nonorthogonal = True, 0.0
         self._share: NDArray[np.float64] | float = 0.0
 
     def _pond(

@@ -261,27 +261,27 @@ class PointData(Keyed):
         self.cells = places.cells
         self.x = places.x
         self.volume, n = weight, len(places.cells)
-        self._rows = {"offset": places.offset, "weight": (weight / points.grid.volumes(self.cells))[:, None]}
+        self.rows = {"offset": places.offset, "weight": (weight / points.grid.volumes(self.cells))[:, None]}
         if points.grid.dim == 3:
-            self._rows["mixed"] = np.zeros_like(places.x) if places.mixed is None else places.mixed
+            self.rows["mixed"] = np.zeros_like(places.x) if places.mixed is None else places.mixed
         if points.grid.axisymmetric:
-            self._rows["hoop"] = places.hoop
-        self._rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
+            self.rows["hoop"] = places.hoop
+        self.rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
         self._gradients: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
         """Return the data of the points `rows`, for the fields of `points`, at the positions `places`."""
-        fields = {name: self._rows[name][rows] for name in points.sizes}
+        fields = {name: self.rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 
     def having(self, **fields: NDArray[np.float64]) -> PointData:
         """Return the same points, with new values (n, ...) of some fields."""
-        kept = {name: self._rows[name] for name in self.points.sizes}
+        kept = {name: self.rows[name] for name in self.points.sizes}
         return PointData(self.points, self.places, self.volume, kept | fields)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """Return the values (n, size) of a field."""
-        return self._rows[name]
+        return self.rows[name]
 
     def gradients(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array; stores the last result."""
@@ -353,9 +353,10 @@ class Rows:
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return a buffer for at least `size` rows.  It is kept between steps, because allocation of memory is slow."""
-        if self._room.value is None or size > len(self._room.value):
-            return self._room(size, lambda: np.zeros((size, self._width)))
-        return self._room.value
+        room = self._room.value
+        if room is None or size > len(room):
+            room = self._room(size, lambda: np.zeros((size, self._width)))
+        return room
 
     def __call__(
         self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
@@ -377,7 +378,7 @@ class Rows:
         cells = data.cells[chosen]
         rows, dofs = self.room(len(cells))[: len(cells)], []
         for columns, name in self._fixed:
-            rows[:, columns] = data[name][chosen]
+            rows[:, columns] = data.rows[name][chosen]
         for columns, values, of_cells, bs in self._gathered:
             at = of_cells[cells][:, :, None].astype(np.intp) * bs + np.arange(bs)  # numpy's index type avoids copies
             dofs.append((columns, values, at.reshape(len(cells), at.shape[1] * bs)))

@@ -527,7 +527,7 @@ class Grid:
     @property
     def cells(self) -> int:
         """Number of cells of one copy."""
-        return int(np.prod(self.shape))
+        return prod(self.shape.tolist())
 
     @property
     def nodes(self) -> int:
@@ -608,7 +608,7 @@ class Grid:
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the indices along the axes and the index of the copy (n, d + 1) of local cells (n,)."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
-        return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
+        return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if not on this process."""

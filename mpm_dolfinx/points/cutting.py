@@ -139,10 +139,10 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
     volume, middle = np.abs(simplex_volumes(v)), v[-1]
-    whole, moment = volume.sum(axis=0), np.zeros_like(middle)
+    whole, moment = np.add.reduce(volume), np.zeros(middle.shape)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
-        moment += share * (v[simplex].sum(axis=0) / len(simplex) - middle)
-    return (middle + np.divide(moment, whole, out=np.zeros_like(moment), where=whole > 0)).T.copy()
+        moment += share * (np.add.reduce(v[simplex]) / len(simplex) - middle)
+    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole > 0)).T.copy()
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
@@ -346,13 +346,14 @@ def _sum(
         return (x[:, a] * x[:, b]).sum(axis=0)
 
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
-    shadow = total(area[0])
-    beyond = slots.beyond(shadow, 0)
-    volume = total(area[0] * sums[0] / d) + beyond
-    moments = [total(products / 2 * (sums[0] ** 2 + pair(0, 0))) + beyond / 2]
+    rows = [area[0], area[0] * sums[0] / d, products / 2 * (sums[0] ** 2 + pair(0, 0))]
     for a in range(1, d):
-        within = total(products * (sums[0] * sums[a] + pair(0, a)))
-        moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
+        rows += [products * (sums[0] * sums[a] + pair(0, a)), area[0] * sums[a] / d]
+    shadow, volume, moment, *others = sum_by(slot, np.array(rows), slots.size)
+    beyond = slots.beyond(shadow, 0)
+    volume, moments = volume + beyond, [moment + beyond / 2]
+    for within, along in zip(others[::2], others[1::2], strict=True):
+        moments.append(within + slots.beyond(along, 0))
     pairs = [(1, 2), (0, 2), (0, 1)] if d == 3 else [(0, 1)] * second
     pairs += [(a, a) for a in range(d)] * second
     uneven = _products(pairs, x, sums, area[0], pair, total, slots)
@@ -613,9 +614,9 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
     """Slice simplices, in positions for slicing, by the grid planes of an axis until no simplex crosses a plane."""
     done_s, done_owner = [], []
     while True:
-        t = s[:, axis]
-        plane = np.floor(t.min(axis=0)) + 1 if grid.even else grid.next_plane(axis, t.min(axis=0))
-        crossing = t.max(axis=0) > plane
+        least, most = np.minimum.reduce(s[:, axis]), np.maximum.reduce(s[:, axis])
+        plane = np.floor(least) + 1 if grid.even else grid.next_plane(axis, least)
+        crossing = most > plane
         if not crossing.any():
             break
         done_s.append(s.compress(~crossing, axis=2))
@@ -629,7 +630,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 def cut_at(s, owner, axis: int, plane):
     """Cut each simplex at a plane; return the parts below and above it with their owners."""
     order = s[:, axis].argsort(axis=0)
-    s = np.take_along_axis(s, order[:, None], axis=0)
+    s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
     dim = len(s) - 1
     parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}

@@ -209,7 +209,7 @@ class Newton:
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
         forms, active = momentum.forms, momentum.forms.active.now
-        self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
+        self._vectors = [(forms.u.x, active.dofs)] + ([(storage.forms.p.x, active.cells)] if storage is not None else [])
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
         """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
@@ -311,7 +311,7 @@ class Newton:
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
-        return [f.x.array[rows] for f, rows in self._functions]
+        return [x.array[rows] for x, rows in self._vectors]
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
@@ -321,9 +321,9 @@ class Newton:
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
         """Set (u, p) to an iterate."""
-        for (f, rows), values in zip(self._functions, iterate, strict=True):
-            f.x.array[rows] = values
-            f.x.scatter_forward()
+        for (x, rows), values in zip(self._vectors, iterate, strict=True):
+            x.array[rows] = values
+            x.scatter_forward()
 
     def _stable(self, found: Errors) -> Errors:
         """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.

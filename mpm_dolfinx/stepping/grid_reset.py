@@ -597,7 +597,7 @@ class Assembled(Keyed):
         contents = self._on_grid.contents
         grid = self._on_grid.cut.grid
         u = self._nodal
-        varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
+        varies = (t,) if any([one.varies for one in self._stage.feeding]) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may depend on time
         wet = Wet(on_grid.cut, at, contents, t, data.of_points, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
@@ -629,15 +629,13 @@ class Assembled(Keyed):
             return feeds, lambda begins: of_cut
         rests = on_grid.rests(state) if not self._varies else None
 
-        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
-            return set_fluxes(mobility(begins), contents.motion(nodal, rests))
-
         # a substep begins at the end of the previous one
-        at_u = (data.pieces.key, weight, *varies)
+        at_u, steady = (data.pieces.key, weight, *varies), None if self._varies else mobility(True)
 
         def outflow(begins: bool) -> Outflow:
             nodal = contents.nodal(u)
-            return self._outflow((*at_u, nodal), lambda: at_present(nodal, begins), grid.comm)
+            make = lambda: set_fluxes(steady or mobility(begins), contents.motion(nodal, rests))  # noqa: E731
+            return self._outflow((*at_u, nodal), make, grid.comm)
 
         return feeds, outflow
 
