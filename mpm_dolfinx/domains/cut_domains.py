@@ -217,7 +217,7 @@ class CutDomains(Keyed):
         for k, faces in enumerate(several):
             own = (surface == k).nonzero()[0]
             anew = renewed and renewed.of(face[own] - (len(here) - len(renewed.row)))
-            out.append(Patches(self.grid, faces, *(v[own] for v in rows), anew))
+            out.append(Patches(self.grid, faces, *[v[own] for v in rows], anew))
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -259,7 +259,7 @@ class SideFeeds(Feeds):
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
         self._rains = [depth is not None for depth in ponds]
         self._names, self._before = names, wet.outcome
-        self._contents, self._comm = wet.contents, wet.cut.grid.comm
+        self._at, self._comm = wet.contents.slot(sides.cells), wet.cut.grid.comm
         self._fallen = sides.rain
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
@@ -303,7 +303,7 @@ class SideFeeds(Feeds):
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
         """Return the faces with the outside pressures of `sides`."""
-        at = self._contents.slot(sides.cells)
+        at = self._at
         conductance, inflow = sides.driven(at, flow)
         offset = flow.deformed(at, sides.offset)
         if flow.relative is None:

@@ -411,9 +411,9 @@ class StorageProblem:
         if forms.retains:  # dry pores hardly couple both balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
             tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
-        softest = contents.softest(softness) if forms.softens else np.ones(1)
+        softest = contents.softest(softness) if forms.softens else np.array([1.0])
         known = [(tau * squared > least).any(), (softest * tau * squared > least).any() and softest.max() > 1]
-        somewhere = over_all(forms.grid.comm, np.array([*known, any(one.settles for one in feeds)], dtype=float)) > 0
+        somewhere = over_all(forms.grid.comm, np.array([*known, any([one.settles for one in feeds])], dtype=float)) > 0
         self.damped, flows, self._settles = somewhere.tolist()
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
@@ -582,13 +582,13 @@ class StorageProblem:
             system.D.multAdd(step, r, r)
         if self._softer is not None:
             self._softer.multAdd(step, r, r)
-        rates = self._rates(outflow)
-        now = rates.integrated(self.dt)
-        mass = r.array_r + now.cells + before.cells
+        rates, dt = self._rates(outflow), self.dt
+        mass = r.array_r + dt * rates.cells + before.cells
         r.array_w[:] = mass / density
         # bound of rounding errors: of volumes, and of fluxes that cancel
-        round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
-        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.net + before.net
+        round_off = 8 * EPSILON * (self._contents.volume + dt * rates.turnover + before.turnover)
+        exchanged, gain = np.abs(change) + dt * rates.gain + before.gain, change + dt * rates.net + before.net
+        rows = exchanged, round_off, np.abs(mass), gain
         return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
@@ -622,7 +622,7 @@ class StorageProblem:
 
         Volumes refer to the density at mid-step, as in `change`.  `rates` are the rates at the end of the substep.
         """
-        return (-rates.integrated(self.dt).cells - self._before.cells) / self._density
+        return (-self.dt * rates.cells - self._before.cells) / self._density
 
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()

@@ -365,7 +365,7 @@ class SceneMaterials:
         """Names of material constants, each with a material that has it."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
-    @property
+    @cached_property
     def field_names(self) -> list[str]:
         """Names of material constants that are functions of position."""
         return list(dict.fromkeys(name for i in self._used for name in self._fields[i]))
@@ -375,7 +375,7 @@ class SceneMaterials:
         """Whether a law has a state."""
         return any(law.state for law in self.laws)
 
-    @property
+    @cached_property
     def state_names(self) -> list[str]:
         """Names of the laws' state variables."""
         return list(dict.fromkeys(name for law in self.laws for name in law.state))

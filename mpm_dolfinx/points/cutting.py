@@ -378,7 +378,7 @@ def _sum(
     for a, section in enumerate(sections):
         shadow = total(area[a]) if a else shadow
         beyond = slots.beyond(shadow, a)
-        lower, upper = (total(area[a], chosen) for chosen in ends[a])
+        lower, upper = total(area[a], ends[a][0]), total(area[a], ends[a][1])
         # areas of the body's sections just above the lower and just below the upper face
         np.multiply([(beyond + shadow - lower)[kept], (beyond + upper)[kept]], h.prod(axis=0) / h[a], out=section)
 

@@ -219,7 +219,8 @@ class Motion:
         out = [(np.array(moved) / np.where(whole > 0, whole, 1.0)).T.ravel()]
         out[0] += ratio * self._momentum.u.x.array[self._momentum.active.now.dofs]
         if self._storage is not None:
-            p, p_n = (f.x.array[self._momentum.active.now.cells] for f in (self._storage.p, self._storage.p_n))
+            cells = self._momentum.active.now.cells
+            p, p_n = self._storage.p.x.array[cells], self._storage.p_n.x.array[cells]
             out.append(p_n + ratio * (p - p_n))
             out[1][: len(volume)] += sums[-1] / volume  # owned cells come first; Newton's method updates ghosts
         return out

@@ -25,7 +25,7 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
-from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
+from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets, off_middle
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
@@ -102,6 +102,7 @@ class OnGrid(Keyed):
         np.maximum.at(self.stiffness, cut.cells, rows)
         self.contents = None
         self._mixed, self._borders = None, None
+        self._sides: Latest[OpenSides] = Latest()
         if storage is not None:
             brought = PieceContents(
                 cells=cut.cells,
@@ -161,9 +162,10 @@ class OnGrid(Keyed):
         if not state.stays:
             bulk = self._storage.bulk
             retentions, new = self._quadrature.materials.retentions, self.cut.pieces
-            rest = np.zeros(self.cut.grid.dim) if retentions is None else retentions.weight.value
-            old = state.pieces.potentials(bulk).less(rest)  # keeps hydrostatic states, although S is not linear
-            carried = transport(old, self.cut.points, new) + new.x @ rest
+            old, rest = state.pieces.potentials(bulk), None if retentions is None else retentions.weight.value
+            # without hydrostatic pressures, because the storage of unsaturated soil is not linear
+            carried = transport(old if rest is None else old.less(rest), self.cut.points, new)
+            carried = carried if rest is None else carried + new.x @ rest
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
             p = pressure_of(self._means(carried), bulk)
@@ -331,8 +333,10 @@ class OnGrid(Keyed):
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
-        sides = open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)
-        sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        place = lambda: open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)  # noqa: E731
+        sides = self._sides((stage, t), place, self.cut.grid.comm)
+        if bulk < np.inf:
+            sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
         cells, seen = self.cells, np.zeros(len(p))
         seen[cells] = mass_potential(p[cells], bulk)
         if at_rest is not None:
@@ -632,10 +636,12 @@ class Assembled(Keyed):
         # a substep begins at the end of the previous one
         at_u, steady = (data.pieces.key, weight, *varies), None if self._varies else mobility(True)
 
+        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
+            return set_fluxes(steady or mobility(begins), contents.motion(nodal, rests))
+
         def outflow(begins: bool) -> Outflow:
             nodal = contents.nodal(u)
-            make = lambda: set_fluxes(steady or mobility(begins), contents.motion(nodal, rests))  # noqa: E731
-            return self._outflow((*at_u, nodal), make, grid.comm)
+            return self._outflow((*at_u, nodal), partial(at_present, nodal, begins), grid.comm)
 
         return feeds, outflow
 
