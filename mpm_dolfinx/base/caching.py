@@ -41,6 +41,8 @@ class Latest(Generic[T]):
             for one in self._derived:
                 one.clear()
             self._entry = key, make()
+        elif self._entry[0] is not key:
+            self._entry = key, self._entry[1]  # the next call mostly has the same objects in its key
         return self._entry[1]
 
     @property

@@ -85,7 +85,8 @@ def numbers(
         out = None if out.dtype.kind in "USc" else out.astype(float)  # "1" is text, not a number
     except (TypeError, ValueError):
         out = None
-    if out is None or not {out.shape, None}.intersection(shapes or [()]) or not np.logical_and.reduce(test(out), axis=None):
+    fits = out is not None and {out.shape, None}.intersection(shapes or [()])
+    if not fits or not np.logical_and.reduce(test(out), axis=None):
         shape = f" of shape {out.shape}" if out is not None and out.ndim > 1 else ""
         raise ValueError(f"{name} = {line(value)}{shape}, must be {allowed}")
     return out

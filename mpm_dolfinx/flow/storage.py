@@ -52,7 +52,7 @@ from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
-from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials

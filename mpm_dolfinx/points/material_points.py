@@ -180,7 +180,7 @@ class MaterialPoints:
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
     def strained(self, F: NDArray[np.float64], **others: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with another F, in the shape of `F_of_laws`, and with other values of the fields `others`."""
+        """Return the points with another F, in the shape of `F_of_laws`, and with the fields `others`."""
         if ACROSS not in self.data:
             return replace(self, F=F, **others)
         F, across = in_plane(F)

@@ -209,7 +209,9 @@ class Newton:
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
         forms, active = momentum.forms, momentum.forms.active.now
-        self._vectors = [(forms.u.x, active.dofs)] + ([(storage.forms.p.x, active.cells)] if storage is not None else [])
+        self._vectors = [(forms.u.x, active.dofs)]
+        if storage is not None:
+            self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
         """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
