@@ -107,6 +107,7 @@ class Place(NamedTuple):
     t: float  # end of the substep, s
     before: Outcome  # reactions, outflows and other results of the previous step
     inertia: bool = False  # whether the bodies have inertia
+    begins: bool = False  # whether the step is the first of its stage
 
 
 class Shares(NamedTuple):

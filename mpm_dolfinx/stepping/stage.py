@@ -122,8 +122,8 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if the stage cannot begin at this place."""
-        for one in self.acting:
+        """Raise an error if the stage begins and cannot begin at this place."""
+        for one in self.acting if place.begins else ():
             one.check_start(place)
 
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:

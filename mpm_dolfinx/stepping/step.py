@@ -32,9 +32,9 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all faces are cut together
     data = on_grid.data_of(state)
-    place = Place(on_grid.cut, on_grid.fill, state.points, data, state.t, dt, state.t, state.outcome, stage.inertia)
-    if state.begins:
-        stage.check_start(place)
+    now = state.t, dt, state.t, state.outcome, stage.inertia, state.begins
+    place = Place(on_grid.cut, on_grid.fill, state.points, data, *now)
+    stage.check_start(place)
     loads = [stage.placed(place._replace(t=t)) for t in times]
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
