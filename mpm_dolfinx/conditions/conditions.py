@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -56,14 +55,9 @@ class Condition:
             if callable(getattr(self, name)):
                 check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
-    @cached_property
-    def _line(self) -> str:
-        """The condition in messages."""
-        return line(self)
-
     def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
         """Return the value of an attribute at time t (s), see `validation.given`."""
-        what, among = f"{self._line}: {name} at t = {t:g} s", self.FUNCTIONS[name]
+        what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
         return given(what, getattr(self, name), t, *more, among=among, **options)
 
 

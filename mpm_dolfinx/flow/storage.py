@@ -254,9 +254,8 @@ class StorageSystem:
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
-        self._facets, self._uniform = facets, None
-        if fluxes.relative is None:
-            self._uniform = tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
+        self._facets = facets
+        self._uniform = self._over_uniform() if fluxes.relative is None else None
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # also of a cell without faces
         pattern = self.L
@@ -269,14 +268,12 @@ class StorageSystem:
     @property
     def gravity(self) -> FacetSum | None:
         """Form of the fluxes by p and the fluid's weight between cells of the same soil; None without weight."""
-        return self._over_uniform()[1]
+        return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
         """Return forms over the faces between cells of the same soil, see `Relative`: fluxes by p; see `gravity`."""
-        if self._uniform is not None:
-            return self._uniform
-        fluxes = self._forms.fluxes
-        facets = fluxes.relative.uniform(self._facets)
+        fluxes, facets = self._forms.fluxes, self._facets
+        facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -329,7 +326,7 @@ class StorageSystem:
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
             borders = relative.set_pressures(self._forms.p.x.array, force)
-        if (flux := self._over_uniform()[0]) is not None:
+        if (flux := (self._uniform or self._over_uniform())[0]) is not None:
             flux.assemble_matrix(self.T)
         if borders is not None:
             borders.add_slopes(self.T, self.unknowns)

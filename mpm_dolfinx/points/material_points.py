@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
@@ -167,12 +166,10 @@ class MaterialPoints:
     def __len__(self) -> int:
         return len(self.id)
 
-    @cached_property
+    @property
     def J(self) -> NDArray[np.float64]:
         """Volume ratio det F (n,)."""
-        J = determinant(self.F)
-        J.flags.writeable = False
-        return J
+        return determinant(self.F)
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:

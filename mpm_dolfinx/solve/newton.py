@@ -414,8 +414,8 @@ class Newton:
         if first and not np.isfinite(norm := r.norm() + size):
             where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
             raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
-        worst_u, worst_p = (np.maximum.reduce(np.array([error_u, error_p]), axis=1, initial=0.0)).tolist()
-        self.report.history.append((worst_u, worst_p))
+        largest = np.maximum.reduce(np.array([error_u, error_p]), axis=1, initial=0.0)
+        self.report.history.append(tuple(largest.tolist()))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:

@@ -180,8 +180,7 @@ class Motion:
         if not any(again):
             return replace(state, **new, stay=Stay(cut.points)), folded
         if carried is not None:
-            more = (carried.of_cell, carried.start) if some else (None, None)
-            new["pieces"] = self._left(carried, points, state.stage, t, on_grid, *more)
+            new["pieces"] = self._left(carried, points, state.stage, t, on_grid, some)
         kept = {name: self._kept(getattr(state, name), on_grid, keeps) if some else None for name in ("held", "rest")}
         return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), folded
 
@@ -415,16 +414,10 @@ class Motion:
             return {"owed": defect, "due": np.zeros(len(points))}
         part, count = on_grid.parts
         share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
-        mean = self._means(part, count, points.volume0 * ~none, defect) * self._sealed(state, on_grid, pieces)
+        weight = points.volume0 * ~none
+        total, whole = over_all(cut.grid.comm, sum_by(part, np.array([weight * defect, weight]), count))
+        mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * self._sealed(state, on_grid, pieces)
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
-
-    def _means(
-        self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the weighted mean (count,) of the values of each part's points; zero for parts without points."""
-        sums = sum_by(part, np.array([weight * values, weight]), count)
-        total, whole = over_all(self._momentum.grid.comm, sums)
-        return np.divide(total, whole, out=np.zeros(count), where=whole > 0)
 
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
         """Return which parts (count,) have no open sides, and no sources at the end of the step."""
@@ -463,23 +456,13 @@ class Motion:
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state in which points store the pressures of their pieces: the next step resets the grid."""
-        pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid)
+        pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid, False)
         return replace(state, pieces=pieces, stay=None)
 
     def _left(
-        self,
-        carried: PiecePressures,
-        points: MaterialPoints,
-        stage: Stage,
-        t: float,
-        on_grid: OnGrid,
-        of_cell: NDArray[np.float64] | None = None,
-        start: NDArray[np.float64] | None = None,
+        self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces to be moved to the next grid, with pressures at their centroids at time t, s.
-
-        of_cell, start: see `PiecePressures`.
-        """
+        """Return the pieces at time t, s, with pressures to be moved; some: whether other pieces stay."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J
@@ -489,8 +472,8 @@ class Motion:
             pressure, slope, bounds = on_grid.pressures_at_pieces(
                 self._reconstruction, pieces.fraction * store[pieces.point], stage, t, water, at_rest
             )
-        leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": of_cell, "start": start}
-        return replace(carried, **leaves)
+        stays = {} if some else {"of_cell": None, "start": None}
+        return replace(carried, pressure=pressure, slope=slope, bounds=bounds, **stays)
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
