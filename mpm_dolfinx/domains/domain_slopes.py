@@ -35,16 +35,8 @@ from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
 class Neighbours:
     """Neighbours of domains across shared faces, also on other processes.
 
-    Parameters
-    ----------
-    comm
-        Communicator of the processes.
-    bodies
-        All bodies of the scene.
-    ids : (n,)
-        Identifiers of the material points of this process.
-    chosen : (n,)
-        Whether to find the neighbours of each point.
+    comm: communicator of the processes; bodies: all bodies of the scene; ids (n,): identifiers of the material points
+    of this process; chosen (n,): whether to find the neighbours of each point.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):

@@ -304,8 +304,7 @@ class SideFeeds(Feeds):
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
         """Return the faces with the outside pressures of `sides`."""
         at = self._at
-        conductance, inflow = sides.driven(at, flow)
-        offset = flow.deformed(at, sides.offset)
+        (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
         if flow.relative is None:
             return OpenFaces(at, conductance, inflow, self._seeps, offset)
         drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight

@@ -96,8 +96,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A = PETSc.Mat().create(rows.comm)
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
-    length = np.zeros(rows.size, dtype=PETSc.IntType)
-    length += np.asarray(row_length, dtype=PETSc.IntType)
+    length = np.zeros(rows.size, dtype=PETSc.IntType) + np.asarray(row_length, dtype=PETSc.IntType)
     elsewhere = np.minimum(length, columns.global_size) if rows.comm.size > 1 else 0
     A.setPreallocationNNZ((np.minimum(length, columns.size), elsewhere))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)

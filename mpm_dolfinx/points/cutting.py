@@ -280,9 +280,7 @@ class _Slots:
         self.low = np.minimum(np.maximum(np.floor(y.min(axis=0)).astype(np.int64), 0), top)
         self.high = np.minimum(np.maximum(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low), top)
         self._span = span = self.high - self.low + 1
-        self._stride = np.ones(span.shape, dtype=np.int64)
-        for axis in range(len(span) - 1, 0, -1):
-            self._stride[axis - 1] = self._stride[axis] * span[axis]
+        self._stride = np.array([np.multiply.reduce(span[axis + 1 :]) for axis in range(len(span))])
         count = self._stride[0] * span[0]
         stop = count.cumsum()
         self.size = int(stop[-1]) if len(stop) else 0
@@ -619,11 +617,10 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
         crossing = most > plane
         if not crossing.any():
             break
-        done_s.append(s.compress(~crossing, axis=2))
-        done_owner.append(owner[~crossing])
-        below, below_owner, s, owner = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
-        done_s.append(below)
-        done_owner.append(below_owner)
+        below, below_owner, *above = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
+        done_s += [s.compress(~crossing, axis=2), below]
+        done_owner += [owner[~crossing], below_owner]
+        s, owner = above
     return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
 
 
@@ -645,12 +642,7 @@ def cut_at(s, owner, axis: int, plane):
         for where, simplices in _CUTS[dim][k].items():
             parts[where] += [np.array([points[p] for p in simplex]) for simplex in simplices]
             owners[where] += [owner[chosen]] * len(simplices)
-    return (
-        np.concatenate(parts["below"], axis=2),
-        np.concatenate(owners["below"]),
-        np.concatenate(parts["above"], axis=2),
-        np.concatenate(owners["above"]),
-    )
+    return [np.concatenate(rows[where], axis=-1) for where in ("below", "above") for rows in (parts, owners)]
 
 
 def _on_plane(a, b, axis: int, plane):

@@ -64,16 +64,9 @@ Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.
 class Motion:
     """Motion of a scene's material points in a step.
 
-    Parameters
-    ----------
-    materials
-        The materials of the scene.
-    bodies
-        All bodies of the scene.
-    momentum, storage
-        Forms of the two balances, with u and p of a solved step; storage is None without fluid.
-    keeps_volumes
-        Whether yielded domains keep the volumes of their points, see `kept_volumes`.
+    materials: the materials of the scene; bodies: all bodies of the scene; momentum, storage: forms of the two
+    balances, with u and p of a solved step; storage is None without fluid; keeps_volumes: whether yielded domains keep
+    the volumes of their points, see `kept_volumes`.
     """
 
     def __init__(

@@ -108,7 +108,7 @@ class Trend:
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
         """Return changes (n, ...) in a time (s), by the polynomial through the last states; implicit: as by Euler.
 
-        If first > 0, the change in an implicit substep of this length (s), continued at its rate, is subtracted.
+        If first > 0, a first implicit substep of this length (s), continued at its rate, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
