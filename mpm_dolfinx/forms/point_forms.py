@@ -353,10 +353,10 @@ class Rows:
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return a buffer for at least `size` rows.  It is kept between steps, because allocation of memory is slow."""
-        room = self._room.value
-        if room is None or size > len(room):
-            room = self._room(size, lambda: np.zeros((size, self._width)))
-        return room
+        buffer = self._room.value
+        if buffer is None or size > len(buffer):
+            buffer = self._room(size, lambda: np.zeros((size, self._width)))
+        return buffer
 
     def __call__(
         self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]

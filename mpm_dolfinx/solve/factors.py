@@ -20,8 +20,6 @@ of the time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from petsc4py import PETSc
 
 import numpy as np
@@ -234,21 +232,21 @@ class NodalFactors:
         self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # all on process 0
         self._dim, self._symmetric = unknowns.dim, symmetric
         self._factors: Latest[BlockFactors] = Latest()
-        self.solve: Callable[[NDArray[np.float64]], NDArray[np.float64]] = np.positive  # if there are no unknowns
-        """Function that returns the solution for a right-hand side, for all unknowns."""
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Set the matrix, in compressed rows."""
         if len(rows) > 1:  # else walls fix all nodes, and PETSc cannot factorise an empty matrix
             make = (rows, columns, *self._nodes, self._dim, self._symmetric)
-            factors = self._factors((rows, columns), lambda: BlockFactors(*make))
-            factors.take(values)
-            self.solve = factors.solve
+            self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
         if self._factors.value is not None:
             self._factors.value.factorise()
+
+    def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the solution for the right-hand side b, for all unknowns."""
+        return self._factors.value.solve(b) if len(b) else b
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -465,8 +465,8 @@ class Motion:
             pressure, slope, bounds = on_grid.pressures_at_pieces(
                 self._reconstruction, pieces.fraction * store[pieces.point], stage, t, water, at_rest
             )
-        stays = {} if some else {"of_cell": None, "start": None}
-        return replace(carried, pressure=pressure, slope=slope, bounds=bounds, **stays)
+        none = {} if some else {"of_cell": None, "start": None}
+        return replace(carried, pressure=pressure, slope=slope, bounds=bounds, **none)
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
