@@ -7,7 +7,7 @@ are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
-  there becomes `EDGES` edges, with the same ends, area and sharp corners.
+  there becomes `EDGES` edges, with the same ends, area and sharp corners; in axisymmetry with the same volume.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
@@ -33,12 +33,12 @@ from mpm_dolfinx.base.fluid_content import pressure_of
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
-from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
+from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen, ring_lengths
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
 from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.cutting import centroids, volumes
+from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
 from mpm_dolfinx.stepping.state import State, Stay
 
@@ -67,7 +67,7 @@ class Renewal:
             row, face = body.outer()
             at = FACES[2][face]
             X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
-            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1) * ring_lengths(self._grid, x.mean(axis=1))
             found.append((start + row, face, keys(start + row, face), size, X))
         columns = [np.concatenate(column) for column in zip(*found, strict=True)]
         order = np.argsort(columns[2])
@@ -215,7 +215,7 @@ class Renewal:
         x = centroids(corners)
         off = x - np.stack([sum_by(at, weight * column, n) / total for column in points.x[old].T], axis=1)
 
-        size = np.abs(volumes(corners))
+        size = np.abs(domain_volumes(corners, self._grid.axisymmetric))
         count = int(group.max()) + 1
         M, V = (sum_by(groups, part * of[source], count) for of in (mass, mass * J))
         A = sum_by(group, size, count)
@@ -255,7 +255,9 @@ class Renewal:
         body[at] = work.body[old]
         moved = mean(points.x - centroids(points.origin))
         d = points.F.shape[1]
-        F = ratio[:, None, None] ** (1 / d) * np.eye(d)
+        stretch = ratio[:, None, None] ** (1 / d)
+        F = stretch * np.eye(d)
+        fixed = x * [not self._grid.axisymmetric, True]  # radii too are stretched
         data = {}
         logs = np.zeros((len(points), 3, 3))
         logs[work.affected] = _of_tensors(np.log, self._elastic(points, np.flatnonzero(work.affected)))
@@ -280,7 +282,7 @@ class Renewal:
             pressure=kept(points.pressure),
             x=x,
             origin=corners - moved[:, None],
-            reference=x[:, None] + (corners - x[:, None]) / ratio[:, None, None] ** 0.5,
+            reference=fixed[:, None] + (corners - fixed[:, None]) / stretch,
             data=data,
         )
 

@@ -235,7 +235,6 @@ class Scene:
             return None
         has = {
             "is in 3D": grid.dim == 3,
-            "is axisymmetric": grid.axisymmetric,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
             "has inertia": self.momentum.inertia is not None,
@@ -244,7 +243,7 @@ class Scene:
         }
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
-            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain")
+            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in 2D")
         return Renewal(self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
