@@ -301,7 +301,7 @@ class _Slots:
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """Return, for each slot, the sum of the values of the slots further along an axis in the same column."""
         out = np.zeros(self.size)
-        for steps in range(1, int(self._span[axis].max(initial=1))):
+        for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
             out[has] += values[has + steps * self._stride[axis][self.point[has]]]
         return out
@@ -532,7 +532,7 @@ def cut_faces(
         """Return positions (n, d), m, relative to the base."""
         return grid.low + grid.h * y if grid.even else y
 
-    points = np.einsum("qk,kam->qam", _RULES[d], s)
+    points = (_RULES[d] @ s.reshape(d, -1)).reshape(-1, *s.shape[1:])
     count = len(_RULES[d])
     middle = place(np.add.reduce(s[:, :d]).T / d)[None].repeat(count, axis=0).reshape(-1, d)
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])

@@ -408,7 +408,7 @@ class Newton:
             fluid, size = None, 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
-                exchanged, size = fluid.exchanged, float(fluid.off.sum())
+                exchanged, size = fluid.exchanged, float(np.add.reduce(fluid.off))
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
