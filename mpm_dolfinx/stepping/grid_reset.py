@@ -99,7 +99,8 @@ class OnGrid(Keyed):
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
         """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the circumference, N/m."""
-        np.maximum.at(self.stiffness, cut.cells, rows)
+        order = rows.argsort(kind="stable")
+        self.stiffness[cut.cells[order]] = rows[order]  # the largest value of a cell is assigned last
         self.contents = None
         self._mixed, self._borders = None, None
         self._sides: Latest[OpenSides] = Latest()
