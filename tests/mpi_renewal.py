@@ -12,7 +12,7 @@ from mpm_dolfinx.stepping import renewal as domains
 CLAY = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3, conductivity=1e-6)
 
 
-def pushed(cells=8, renewal=True, wet=False, rings=False):
+def pushed(cells=8, renewal=True, wet=False, rings=False, **more):
     """Return a simulation of a disc, or with `rings` a ball, that is pushed into a block next to a pressure.
 
     cells: number of cells across the block.
@@ -24,14 +24,14 @@ def pushed(cells=8, renewal=True, wet=False, rings=False):
     walls = {"left": "x", "right": "x", "bottom": "y"}
     numerics = mpm.Numerics(renewal=renewal)
     conditions, fluid = ([disc, load, mpm.Drained("top")], mpm.Fluid()) if wet else ([disc, load], None)
-    options = {"walls": walls, "conditions": conditions, "numerics": numerics, "fluid": fluid}
+    options = {"walls": walls, "conditions": conditions, "numerics": numerics, "fluid": fluid, **more}
     return mpm.Simulation(grid, [block], [CLAY], **options)
 
 
 if __name__ == "__main__":
     domains.LONGEST = 0.6  # cells: soon
     file = Path(sys.argv[1])
-    kind = {name: name in sys.argv for name in ("wet", "rings")}
+    kind = {"wet": "wet" in sys.argv, **{name: True for name in ("inertia", "rings") if name in sys.argv}}
     simulation = pushed(**kind)
     if "restart" in sys.argv:
         half = mpm.Checkpoint(file.with_suffix(".checkpoint"))
@@ -43,11 +43,12 @@ if __name__ == "__main__":
         simulation.run(0.06, 0.01, after=simulation.result, progress=False)
     points = simulation.points
     names = ("plastic", "tool_shear")
-    rows = points.id, points.x, points.volume0, points.pressure, *(points.data[name] for name in names)
+    velocity = points.data.get("velocity", np.zeros_like(points.x))
+    rows = points.id, points.x, points.volume0, points.pressure, *(points.data[name] for name in names), velocity
     parts = simulation.grid.comm.gather(rows)
     if parts:
-        ids, x, volume0, pressure, plastic, shear = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.argsort(ids)
-        of = {"id": ids, "x": x, "volume0": volume0, "pressure": pressure, "plastic": plastic, "shear": shear}
+        order = np.argsort(np.concatenate([part[0] for part in parts]))
+        titles = ("id", "x", "volume0", "pressure", "plastic", "shear", "velocity")
+        of = dict(zip(titles, map(np.concatenate, zip(*parts, strict=True)), strict=True))
         more = {"force": simulation.tool_forces.array, "renewed": simulation.result.renewed}
         np.savez(file.with_suffix(".npz"), **{name: values[order] for name, values in of.items()}, **more)

@@ -16,7 +16,8 @@ from test_many_sizes import at_random
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.cutting import domain_volumes, volumes
+from mpm_dolfinx.mechanics.inertia import velocity_gradients
+from mpm_dolfinx.points.cutting import cut, domain_volumes, volumes
 from mpm_dolfinx.points.polygons import Polygons
 from mpm_dolfinx.stepping import renewal
 
@@ -108,14 +109,14 @@ def test_strains_that_are_linear_stay_within_second_order(monkeypatch, uneven, r
 
 @pytest.mark.parametrize(("uneven", "rings"), [(False, False), (True, False), (True, True)])
 def test_many_renewals_keep_what_a_body_holds(monkeypatch, uneven, rings, count=12):
-    """It turns or rises between them, so that other cells cut it; a velocity is carried as any other value."""
+    """It turns or rises between them, so that other cells cut it."""
     s = block(hole=True, uneven=uneven, rings=rings, inner=0.0 if rings else 0.07)
     points = yielded(s, 1e-3 * np.diag([1.0, -1.0]), 0.1 + s.state.points.x[:, 0])
-    points = replace(points, data=points.data | {"velocity": points.x[:, ::-1] * [-1.0, 1.0]})
+    points = replace(points, data=points.data | {"of the user": points.x[:, ::-1] * [-1.0, 1.0]})
 
     def held():
         mass = points.volume0
-        carried = [mass @ points.data[name] for name in ("hardened", "velocity")]
+        carried = [mass @ points.data[name] for name in ("hardened", "of the user")]
         return np.hstack([mass.sum(), mass @ points.J, *carried])
 
     before, size = held(), domain_volumes(points.corners, rings).sum()
@@ -139,6 +140,62 @@ def test_many_renewals_keep_what_a_body_holds(monkeypatch, uneven, rings, count=
 @pytest.mark.slow
 def test_a_thousand_renewals_keep_what_a_body_holds(monkeypatch):
     test_many_renewals_keep_what_a_body_holds(monkeypatch, False, False, 1000)
+
+
+def momenta(s, points):
+    """Return mass and momentum (3,), angular momentum, the centre of mass (2,), and the kinetic energy."""
+    pieces, density = cut(s.grid, points.corners, second=True), s.scene.materials.present_density(points)
+    at, L = pieces.point, velocity_gradients(points)
+    m, x = pieces.fraction * (density * points.volume0 * points.J)[at], pieces.x
+    v = points.data["velocity"][at] + np.einsum("nij,nj->ni", L[at], x - points.x[at])
+    turning = L[at] @ pieces.second
+    spin = x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0] + turning[:, 1, 0] - turning[:, 0, 1]
+    energy = (v**2).sum(axis=1) + np.einsum("nij,nij->n", turning, L[at])
+    return np.array([m.sum(), *(m @ v)]), m @ spin, m @ x / m.sum(), m @ energy / 2
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_momentum_stays_and_a_uniform_velocity(monkeypatch, uneven):
+    """The block is turned, so that the grid cuts it anew; its centre stays up to crumbs of a millionth of a cell."""
+    s = block(hole=True, uneven=uneven, inertia=True)
+    points, middle = yielded(s, 1e-3 * np.diag([1.0, -1.0])), np.array([1.0, 0.65])
+    R = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    points = replace(points, **{name: middle + (getattr(points, name) - middle) @ R.T for name in ("corners", "x")})
+    x, y = points.x.T
+    wavy = np.stack([np.sin(3 * y) + 1, x**2], axis=1)
+    slope = np.array([[0 * x, 3 * np.cos(3 * y)], [2 * x, 0 * x]]).transpose(2, 0, 1)
+    for v, L, energy in ((np.ones_like(wavy), 0 * slope, 1e-13), (wavy, slope, 1e-4)):
+        old = replace(points, data=points.data | {"velocity": v, "F_rate": L @ points.F})
+        new, count = renewed(s, old, monkeypatch, 0.4)
+        assert count > 700
+        before, after = momenta(s, old), momenta(s, new)
+        assert after[0] == pytest.approx(before[0], rel=1e-13)
+        assert after[1] == pytest.approx(before[1], rel=1e-5)
+        assert after[2] == pytest.approx(before[2], abs=1e-6)
+        assert after[3] == pytest.approx(before[3], rel=energy)
+    new, _ = renewed(s, replace(old, data=old.data | {"velocity": 1 + 0 * v, "F_rate": 0 * L}), monkeypatch, 0.4)
+    assert np.abs(new.data["velocity"] - 1).max() < 1e-13 and np.abs(new.data["F_rate"]).max() < 1e-12
+
+
+def test_clay_that_flies_and_stretches_keeps_its_momentum_and_tells_its_energy():
+    """Renewal takes less than a thousandth of its energy."""
+    grid = mpm.Grid([-1, -1], [1.5, 1.5], [20, 20])
+    block = mpm.box(grid, [-0.3, -0.3], [0.3, 0.3])
+    clay = mpm.DruckerPrager(5e5, 1e4, friction=0.0, dilation=0.0, cohesion=50.0, porosity=0.4, grain_density=2700.0)
+    motion = np.array([[2.5, -1.0], [1.0, -2.5]])
+    options = {"walls": {}, "inertia": True, "numerics": mpm.Numerics(renewal=True)}
+    s = mpm.Simulation(grid, [block], [clay], velocity=lambda x: [1.0, 0.5] + x @ motion.T, **options)
+    before = momenta(s, s.state.points)
+    result = s.run(0.5, 0.02, energies=True, progress=False)
+    after, e = momenta(s, s.state.points), result.energies
+    assert result.renewed > 50 and result.cuts == 0
+    assert after[0] == pytest.approx(before[0], rel=1e-12)
+    assert after[1] == pytest.approx(before[1], rel=1e-3)
+    assert after[2] - before[2] == pytest.approx([0.5, 0.25], abs=1e-4)
+    assert 0 < e["renewal"][-1] < 1e-3 * e["kinetic"][0]
+    total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["renewal"]
+    assert total == pytest.approx(total[0], rel=3e-3)
+    assert np.abs(np.diff(total)).max() < 3e-4 * total[0]  # no jump where domains are renewed
 
 
 def test_elastic_soil_is_left_alone(monkeypatch):
@@ -188,11 +245,20 @@ def layers(wet, rings=False):
     return scene.with_(steps=8, fluid=2.2e9 if wet else None, renewal=True)
 
 
-@pytest.mark.parametrize(("wet", "rings"), [(False, False), (True, False), (False, True), (True, True)])
-def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet, rings):
+@pytest.mark.parametrize(
+    ("wet", "inertia", "rings"),
+    [
+        (False, False, False),
+        pytest.param(True, False, False, marks=pytest.mark.slow),
+        (True, True, False),
+        (False, False, True),
+        (True, False, True),
+    ],
+)
+def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet, inertia, rings):
     """Mirrored, rotated, carried, in other units and orders, with another body at rest, and after a restart."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
-    scene, plain = layers(wet, rings), Frame.plain(2)
+    scene, plain = layers(wet, rings).with_(inertia=inertia), Frame.plain(2)
     base = run(scene, plain)
     assert len(base[-1].place) > (1.25 if rings else 1.3) * 208
     mirrored = Frame((0, 1), (-1, 1), (1e4, -3e4), length=1e-4, stress=1e3, time=1e-3, order=3, far="resting")
@@ -327,10 +393,11 @@ def test_clay_is_pressed_through_a_die_of_half_its_width(cells=9, depth=1.0, str
 @pytest.mark.parametrize(
     ("processes", "kind"),
     [
-        (1, []),
+        (1, ["wet", "inertia"]),
         (3, ["wet"]),
         (1, ["rings"]),
-        *(pytest.param(2, kind, marks=pytest.mark.slow) for kind in ([], ["wet"], ["wet", "rings"])),
+        *(pytest.param(n, kind, marks=pytest.mark.slow) for n, kind in ((1, []), (2, []), (2, ["wet"]))),
+        *(pytest.param(2, kind, marks=pytest.mark.slow) for kind in (["inertia"], ["wet", "rings"])),
     ],
 )
 def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(processes, kind, tmp_path):
@@ -340,7 +407,7 @@ def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(
     one, other = (np.load(tmp_path / f"{name}.npz") for name in ("whole", "parts"))
     assert one["renewed"] == other["renewed"] > 0
     assert np.array_equal(one["id"], other["id"])
-    for name in ("x", "volume0", "pressure", "plastic", "force", "shear"):
+    for name in ("x", "volume0", "pressure", "plastic", "force", "shear", "velocity"):
         size = np.abs(other[name]).max()
         assert one[name] == pytest.approx(other[name], abs=(0 if processes == 1 else 1e-7) * size)
 
@@ -381,13 +448,13 @@ def test_polygons_are_cut_and_divided():
     ("options", "message"),
     [
         ({"fluid": mpm.Fluid(), "law": replace(mpi_renewal.CLAY, retention=mpm.Gardner(1e-3))}, "has pores that drain"),
-        ({"inertia": True}, "has inertia"),
         ({"law": mpm.Hencky(1e6, 1e6)}, "has no soil"),
+        ({"axisymmetric": True, "inertia": True}, "has inertia in axisymmetry"),
     ],
 )
 def test_scenes_whose_domains_cannot_be_renewed_are_refused(options, message):
     soil = options.pop("law", mpi_renewal.CLAY)
-    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4], axisymmetric=options.pop("axisymmetric", False))
     bodies, walls = [mpm.box(grid, [0, 0], [1.0, 0.5])], {"bottom": "xy"}
     with pytest.raises(
         ValueError, match=f"Numerics: renewal = True: the scene {message}.*, must be of soil that yields"

@@ -94,7 +94,8 @@ class RefilledCells:
     """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
     body (n,): index of each point's body; flowed (n,): whether points may be renewed; needs (n,): whether their domains
-    need renewal; faces: surface of the bodies; signs: the conditions on these faces, see `Renewal._signatures`.
+    need renewal; faces: surface of the bodies; signs: the conditions on these faces, see `Renewal._signatures`; second:
+    whether to compute second moments of the pieces.
     """
 
     def __init__(
@@ -106,11 +107,12 @@ class RefilledCells:
         needs: NDArray[np.bool_],
         faces: OuterFaces,
         signs: tuple[NDArray, NDArray],
+        second: bool = False,
     ):
         self.grid = grid
         self.points = points
         self.body = body
-        self.pieces = cut(grid, points.corners)
+        self.pieces = cut(grid, points.corners, second)
         self.cell = self.pieces.cell
         self.cells = grid.cells
         self.faces = faces

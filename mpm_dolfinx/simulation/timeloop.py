@@ -277,7 +277,8 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
-        outcome["energy"] = initial_energies(scene.materials, state.points, state.stage.kinetic(outcome))
+        kinetic = state.stage.kinetic(outcome)
+        outcome["energy"] = initial_energies(scene.materials, state.points, kinetic, scene.numerics.renewal)
     return replace(state, outcome=outcome)
 
 

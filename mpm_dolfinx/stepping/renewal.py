@@ -12,8 +12,9 @@ are filled anew:
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
 These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
-range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings
-are unchanged.
+range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
+too. Cells with elastic soil, several bodies, prescribed displacements, or several surface
+crossings are unchanged.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen, ring_lengths
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
+from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
 from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
@@ -133,12 +135,17 @@ class Renewal:
         held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
         signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
-        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs)
+        moves = MOTION[0] in points.data
+        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders]
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, touched)
+        if moves:
+            masses = tuple(self._materials.present_density(of) * of.volume0 * of.J for of in (points, made))
+            v, L = velocities(work, made.corners, made.x, group, masses)
+            made = replace(made, data={**made.data, **dict(zip(MOTION, (v, L @ made.F), strict=True))})
         kept = ~work.affected
         replaced = points.id[work.affected]
         stay, pieces = state.stay, state.pieces
@@ -218,7 +225,6 @@ class Renewal:
         size = np.abs(domain_volumes(corners, self._grid.axisymmetric))
         count = int(group.max()) + 1
         M, V = (sum_by(groups, part * of[source], count) for of in (mass, mass * J))
-        A = sum_by(group, size, count)
 
         def mean(values: NDArray) -> NDArray:
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
@@ -232,9 +238,11 @@ class Renewal:
             return np.clip(means, low[group], high[group]).reshape(n, *values.shape[1:])
 
         like = np.exp(mean(np.log(J)))
-        scale = V / M * sum_by(group, size / like, count) / A  # mass and volume are both exact
-        ratio = like * scale[group]
-        volume0 = V[group] * size / A[group] / ratio
+        volume0, volume = (size / one / sum_by(group, size / one, count)[group] for one in (like, 1.0))
+        if work.pieces.second.size:
+            volume0, volume = (centred(work, group, x, *of) for of in ((volume0, mass), (volume, mass * J)))
+        volume0, volume = M[group] * volume0, V[group] * volume  # mass and volume are both exact
+        ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
             """Return means with an exact mass-weighted sum: corrections stay within the values' range."""
@@ -268,7 +276,7 @@ class Renewal:
                 data[name] = work.on_faces(values, corners, parent, group, points)
             elif name == ACROSS:
                 data[name] = across
-            elif name not in (PARENT, AREA, ENDS, "plastic"):
+            elif name not in (PARENT, AREA, ENDS, *MOTION, "plastic"):
                 data[name] = kept(values)
         data |= {PARENT: parent, AREA: area, ENDS: ends}
         used = points.id[points.id >= self._starts[-1]]

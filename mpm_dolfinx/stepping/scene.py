@@ -235,9 +235,9 @@ class Scene:
             return None
         has = {
             "is in 3D": grid.dim == 3,
+            "has inertia in axisymmetry": grid.axisymmetric and self.momentum.inertia is not None,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
-            "has inertia": self.momentum.inertia is not None,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }

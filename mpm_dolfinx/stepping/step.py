@@ -10,7 +10,7 @@ import numpy as np
 
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.conditions.acting import Place
-from mpm_dolfinx.dynamics.energies import after
+from mpm_dolfinx.dynamics.energies import after, after_renewal
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
 from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, leads, left
@@ -50,8 +50,8 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
-    state, earlier = start.state, None
-    on_grid = start.on_grid
+    before, state = state, start.state
+    on_grid, earlier = start.on_grid, None
     flights, found = [flight_of(start)], []
     for placed in start.acting:
         acting = start.begun(placed, earlier)
@@ -75,6 +75,6 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
     now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
-        kinetic = state.stage.kinetic(outcome)
-        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], kinetic, seconds, found)
+        energy = after_renewal(scene.materials, before.outcome["energy"], before.points, state.points, start.renewed)
+        outcome["energy"] = after(energy, scene.materials, now["points"], state.stage.kinetic(outcome), seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
