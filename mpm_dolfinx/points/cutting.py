@@ -532,7 +532,7 @@ def cut_faces(
         """Return positions (n, d), m, relative to the base."""
         return grid.low + grid.h * y if grid.even else y
 
-    points = (_RULES[d] @ s.reshape(d, -1)).reshape(-1, *s.shape[1:])
+    points = (_RULES[d] @ s.reshape(d, -1)).reshape(len(_RULES[d]), *s.shape[1:])
     count = len(_RULES[d])
     middle = place(np.add.reduce(s[:, :d]).T / d)[None].repeat(count, axis=0).reshape(-1, d)
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
