@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from itertools import starmap
 from typing import Any, Generic, TypeVar
 
 from mpi4py import MPI
@@ -42,6 +41,8 @@ class Latest(Generic[T]):
             for one in self._derived:
                 one.clear()
             self._entry = key, make()
+        elif self._entry[0] is not key:
+            self._entry = key, self._entry[1]  # the next call mostly has the same objects in its key
         return self._entry[1]
 
     @property
@@ -70,8 +71,12 @@ def same(a: Any, b: Any) -> bool:
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):
-        others = [pair for pair in zip(a, b, strict=False) if pair[0] is not pair[1]]
-        return len(a) == len(b) and all(starmap(same, others))
+        if len(a) != len(b):
+            return False
+        for one, other in zip(a, b, strict=True):
+            if one is not other and not same(one, other):
+                return False
+        return True
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.shape == b.shape and bool(np.logical_and.reduce(a == b, axis=None))
     return not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and bool(a == b)

@@ -85,7 +85,8 @@ def numbers(
         out = None if out.dtype.kind in "USc" else out.astype(float)  # "1" is text, not a number
     except (TypeError, ValueError):
         out = None
-    if out is None or not {out.shape, None}.intersection(shapes or [()]) or not np.all(test(out)):
+    fits = out is not None and {out.shape, None}.intersection(shapes or [()])
+    if not fits or not np.logical_and.reduce(test(out), axis=None):
         shape = f" of shape {out.shape}" if out is not None and out.ndim > 1 else ""
         raise ValueError(f"{name} = {line(value)}{shape}, must be {allowed}")
     return out
@@ -183,8 +184,10 @@ def _plain(function: Callable) -> bool:
 
 def _parameters(function: Callable) -> list[Parameter] | None:
     """Return the parameters to which arguments are passed; None if they are unknown."""
-    with suppress(KeyError, TypeError):  # some objects have no hash
+    try:
         return _known[function]
+    except (KeyError, TypeError):  # some objects have no hash
+        pass
     try:
         every = list(signature(function).parameters.values())
     except (TypeError, ValueError):  # some built-in functions
@@ -205,9 +208,9 @@ def takes(function: Callable) -> tuple[str, ...] | None:
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
     """Return the arguments of a function with these parameters; see `takes`."""
-    names = ("t",) if parameters is None else tuple([p.name for p in parameters])
-    if len(names) == 1 and names[0] not in PLACES:
+    if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
         return ("t",)
+    names = tuple([p.name for p in parameters])
     if not names or not set(names) <= set(NAMES):
         return None
     return None if names == ("x",) and not _plain(function) else names

@@ -74,10 +74,10 @@ def wall_forces(
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)
-    place, fixed = grid.nodes_along(grid.node_x[node]), [[a in walls.get(name, "") for a in "xyz"] for name in sides]
+    place, fixed = grid.nodes_along(grid.node_x[node]), [a in walls.get(name, "") for name in sides for a in "xyz"]
     across = np.array([component == axis for axis, _ in sides.values()])
     holds = np.array([place[:, axis] == end * grid.shape[axis] for axis, end in sides.values()])
-    holds &= np.array(fixed)[:, component]
+    holds &= np.array(fixed).reshape(-1, 3)[:, component]
     holds = np.where((holds & across).any(axis=0), holds & across, holds)
     shares = holds / np.maximum(1, holds.sum(axis=0)) * forces
     out = grid.comm.allreduce(sum_by(component, shares, d))

@@ -62,12 +62,12 @@ def check_held(
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
     if grid.axisymmetric:  # rings have one rigid-body mode, along the axis
         modes = [direction[:, 1]]
-    R = np.stack(modes, axis=1)
-    reached, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # entry 0: the ground
+    R = np.array(modes).T
+    reached, missing = np.arange(count + 1) == 0, np.full(count, len(modes))  # entry 0: the ground
     while True:
         on = reached[against]
         grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
-        grams, before = grid.comm.allreduce(np.stack(grams)), missing
+        grams, before = grid.comm.allreduce(np.array(grams)), missing
         ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         reached[1:] = missing == 0

@@ -85,7 +85,7 @@ def _second_differences(
     order = np.lexsort(grid.signs.T)  # order of the nodes that matches `bits`
     nodes, neighbours = grid.cell_nodes[cells], grid.neighbours(cells)
     for a in range(d):
-        low, high = (order[bits[:, a] == end] for end in (0, 1))
+        low, high = order[bits[:, a] == 0], order[bits[:, a] == 1]
         first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])
         along = last - first
         ends = []
@@ -99,7 +99,7 @@ def _second_differences(
             else:  # h^2 times the second derivative of a parabola
                 h, g = grid.along(cells, a), grid.along(local, a)
                 ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
-        first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
+        first, last = np.where(known[0], *ends), np.where(known[1], *ends[::-1])
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
         bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
         across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # the same at both ends

@@ -123,14 +123,18 @@ class CutDomains(Keyed):
         self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
-        self._exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
-        self.cells, self.x = grid.local(self._exchange.send(self.pieces.cell)), self._exchange.send(self.pieces.x)
+        exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        self.pieces_to_cells = exchange.send
+        """Function that sends values of the pieces to the owners of their cells."""
+        self.to_pieces = exchange.back
+        """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
+        self.cells, self.x = grid.local(exchange.send(self.pieces.cell)), exchange.send(self.pieces.x)
         """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
-        self.mixed = self._exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
+        self.mixed = exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """In 3D: mean products of the offsets of the pieces, see `Pieces`."""
-        self.second = self._exchange.send(self.pieces.second) if second else None
+        self.second = exchange.send(self.pieces.second) if second else None
         """If `second`: mean products of all offsets of the pieces (m, d, d), m^2."""
-        self.hoop = self._exchange.send(self.pieces.hoop) if grid.axisymmetric else None
+        self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
@@ -150,15 +154,7 @@ class CutDomains(Keyed):
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells; return values (m, ...)."""
-        return self._exchange.send(values[self.pieces.point])
-
-    def pieces_to_cells(self, values: NDArray) -> NDArray:
-        """Send values of the pieces to the owners of their cells."""
-        return self._exchange.send(values)
-
-    def to_pieces(self, values: NDArray) -> NDArray:
-        """Send values (m, ...) of the pieces from the owners of cells back to the processes of the points."""
-        return self._exchange.back(values)
+        return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections."""
@@ -211,11 +207,11 @@ class CutDomains(Keyed):
         places = interpolate(corners.repeat(count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
         outward = face_vectors(corners, number)
-        size = np.linalg.norm(outward, axis=1, keepdims=True)
+        size = np.sqrt(np.add.reduce(outward**2, axis=1, keepdims=True))
         skew = skew[here][face].nonzero()[0]  # over a triangle, positions are linear, but xi is not
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
-        inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros(outward.shape), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.arange(len(several)).repeat(list(map(len, several)))[here][face]
@@ -223,7 +219,7 @@ class CutDomains(Keyed):
         for k, faces in enumerate(several):
             own = (surface == k).nonzero()[0]
             anew = renewed and renewed.of(face[own] - (len(here) - len(renewed.row)))
-            out.append(Patches(self.grid, faces, *(v[own] for v in rows), anew))
+            out.append(Patches(self.grid, faces, *[v[own] for v in rows], anew))
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:

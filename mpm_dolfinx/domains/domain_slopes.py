@@ -27,7 +27,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import FACES, corner_bits, sum_by
+from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
 
@@ -35,16 +35,8 @@ from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
 class Neighbours:
     """Neighbours of domains across shared faces, also on other processes.
 
-    Parameters
-    ----------
-    comm
-        Communicator of the processes.
-    bodies
-        All bodies of the scene.
-    ids : (n,)
-        Identifiers of the material points of this process.
-    chosen : (n,)
-        Whether to find the neighbours of each point.
+    comm: communicator of the processes; bodies: all bodies of the scene; ids (n,): identifiers of the material points
+    of this process; chosen (n,): whether to find the neighbours of each point.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):
@@ -74,7 +66,7 @@ class Neighbours:
 
         `own` (c, k) are c data columns of the k points.  `faces` are, for each face index, the face centres (d, k), m.
         """
-        centres = np.stack(faces, axis=2).reshape(len(faces[0]), own.shape[1] * len(faces))
+        centres = np.array(faces).transpose(1, 2, 0).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
         if self._exchange.comm.size > 1:
             rows = np.concatenate([own[:, point[self._unpaired]], centres[:, self._unpaired]])
@@ -132,18 +124,21 @@ def linear_gradients(
     d, k = cut.grid.dim, F.shape[1]
     slope, inverse = np.zeros((d, k, k, len(F))), np.zeros((d, d, len(F)))
     slope[..., neighbours.rows], inverse[..., neighbours.rows] = _slopes(neighbours, cut, F, soils)
-    offset = [x - sum_by(of, fraction * x, len(F)).take(of) for x in cut.pieces.x.T]
-    xi = [sum(inverse[a, b].take(of) * x for b, x in enumerate(offset)) for a in range(d)]
+    x = cut.pieces.x.T
+    offset = x - sum_by(of, fraction * x, len(F)).take(of, axis=1)
+    xi = np.add.reduce(inverse.take(of, axis=2) * offset, axis=1)
     J, base = determinant(F), F.transpose(1, 2, 0).copy()
     cofactors = cofactor(F).transpose(2, 1, 0).copy()
     e = np.einsum("ijn,ajkn->aikn", cofactors / J, slope)
-    ratio = np.trace(e, axis1=1, axis2=2)
+    ratio = e.trace(axis1=1, axis2=2)
     # the mean is weighted by reference volumes; the second-order part would change the domain's volume and is removed
-    variances = sum_by(of, np.array([[fraction * x * y for y in xi] for x in xi]), len(F))
+    variances = sum_by(of, (fraction * xi)[:, None] * xi, len(F))
     weight, part = np.add.reduce(variances * ratio, axis=1), np.einsum("abn,bjkn->ajkn", variances, e)
     second = 0.5 * (np.add.reduce(weight[:, None, None] * e) - np.einsum("aijn,ajkn->ikn", e, part))
     base = base - np.einsum("ijn,jkn->ikn", base, second) + np.add.reduce(weight[:, None, None] * slope)
-    out = base.take(of, axis=2) + sum(x * slope[a].take(of, axis=2) for a, x in enumerate(xi))
+    out = base.take(of, axis=2)
+    for along, change in zip(xi, slope, strict=True):
+        out += along * change.take(of, axis=2)
     out = np.ascontiguousarray(out.transpose(2, 0, 1))
     ratios = determinant(out)
     if (inverted := ratios <= 0).any():  # such domains keep a uniform gradient
@@ -159,8 +154,8 @@ def _slopes(
     """Return the derivatives (d, k, k, r) of F by xi, and the inverse edge matrices (d, d, r) of domains, 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
-    corners, bits = cut.points.corners[rows].transpose(1, 2, 0).copy(), corner_bits(d)
-    faces = [corners[bits[:, a] == end].sum(axis=0) / 2 ** (d - 1) for a in range(d) for end in (0, 1)]
+    corners = cut.points.corners[rows].transpose(1, 2, 0).copy()
+    faces = [np.add.reduce(corners[at]) / 2 ** (d - 1) for at in FACES[d]]
     edges = np.array([faces[2 * a + 1] - faces[2 * a] for a in range(d)]).swapaxes(0, 1)
     inverse = _inverse(edges)
     own = np.concatenate([F.reshape(len(F), k * k)[rows].T, corners.sum(axis=0) / 2**d, soils[rows].T])
@@ -171,8 +166,8 @@ def _slopes(
         some = np.zeros(len(rows), dtype=bool)
         for face in (2 * axis, 2 * axis + 1):
             neighbours_columns, at_face, known = others(face)
-            joined = known & (np.abs(at_face - faces[face]) <= nearest).all(axis=0)
-            joined &= (neighbours_columns[k * k + d :] == own[k * k + d :]).all(axis=0)
+            joined = known & np.logical_and.reduce(np.abs(at_face - faces[face]) <= nearest)
+            joined &= np.logical_and.reduce(neighbours_columns[k * k + d :] == own[k * k + d :])
             xi = np.add.reduce(inverse * (neighbours_columns[k * k : k * k + d] - own[k * k : k * k + d]), axis=1)
             xi[:, ~joined] = 0.0
             change = neighbours_columns[: k * k] - own[: k * k]

@@ -169,7 +169,7 @@ def _filtered(
     d: NDArray[np.float64],
     crossed: NDArray[np.float64],
     thirds: Sequence[NDArray[np.float64]] | None,
-    axes: tuple[int, ...] | None = None,
+    axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
     """Return values on a box (..., k) of sites, filtered along some axes (default: all); nan marks missing sites.
 
@@ -181,7 +181,7 @@ def _filtered(
     if not axes:
         return d
     by = [None] * (d.ndim - 1) if thirds is None else thirds
-    orders = [_filtered(_along(d, crossed, a, by[a]), crossed, thirds, tuple(b for b in axes if b != a)) for a in axes]
+    orders = [_filtered(_along(d, crossed, a, by[a]), crossed, thirds, [b for b in axes if b != a]) for a in axes]
     return sum(orders[1:], orders[0]) / len(orders)
 
 
@@ -251,7 +251,7 @@ def filtered(
 
     `then` are the points at the last grid reset.  `free` (n,) tells which points are filtered.
     """
-    out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
+    out, cells = np.zeros(points.corners.shape), crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
         moved = points.corners[rows] - points.reference[rows]

@@ -132,12 +132,13 @@ class Reconstruction:
         jump, one_sided, _, drained = self._differences(pressures)
         slope, low, high = van_leer(one_sided), *_bounds_of(jump)
         whole = self.grid.sizes(cells)[..., None] * [-0.5, 0.5]
-        filled = (2 * centroid[cells][:, :, None] - whole[..., ::-1]).clip(whole[..., :1], whole[..., 1:])
+        filled = 2 * centroid[cells][:, :, None] - whole[..., ::-1]
+        filled = np.minimum(np.maximum(filled, whole[..., :1]), whole[..., 1:])
         ends = slope[:, :, None] * (np.where(drained, filled, whole) - origin[:, :, None])
         scale = np.ones(len(cells))
         for end, bound in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
             scale = np.minimum(scale, np.divide(bound, end, out=np.ones(len(cells)), where=end != 0))
-        return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
+        return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return differences and slopes to neighbours and drained sides, and which neighbours and drained sides exist.
@@ -230,30 +231,27 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     common[match] = np.minimum(new.fraction[match], old.fraction[before])
     left_fraction = old.fraction.copy()
     left_fraction[before] -= common[match]
-    leaving = sum_by(owner, left_fraction, n)
     share = common / new.fraction
-
-    def remapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values of the new pieces: the old value on the common part, else the mean of the parts that left."""
-        mean = np.divide(sum_by(owner, left_fraction * values, n), leaving, out=np.zeros(n), where=leaving > 0)
-        old_values = np.zeros(len(new_key))
-        old_values[match] = values[before]
-        return share * old_values + (1 - share) * mean[new.point]
-
-    pressure = remapped(old.pressure)
-    correction = np.zeros(len(new_key))
-    for axis in range(old.x.shape[1]):
-        slope = sum_by(owner, old.fraction * old.slope[:, axis], n)
-        then = old.x[:, axis] - sum_by(owner, old.fraction * old.x[:, axis], n)[owner]
-        now = new.x[:, axis] - sum_by(new.point, new.fraction * new.x[:, axis], n)[new.point]
-        correction += slope[new.point] * (now - remapped(then))
+    # rows are pressure and centroid; the centroid of a piece is relative to that of its domain
+    sums, d = sum_by(owner, old.fraction * np.concatenate([old.slope, old.x], axis=1).T, n), old.x.shape[1]
+    slope, centre = sums[:d], sums[d:]
+    then = np.concatenate([old.pressure[None], old.x.T - centre[:, owner]])
+    leaving = sum_by(owner, np.concatenate([left_fraction[None], left_fraction * then]), n)
+    mean = np.divide(leaving[1:], leaving[0], out=np.zeros((len(then), n)), where=leaving[0] > 0)
+    # a new piece has the old value on the common part, else the mean of the parts that left
+    values = np.zeros((len(then), len(new_key)))
+    values[:, match] = then[:, before]
+    values = share * values + (1 - share) * mean[:, new.point]
+    pressure = values[0]
+    now = new.x.T - sum_by(new.point, new.fraction * new.x.T, n)[:, new.point]
+    correction = np.add.reduce(slope[:, new.point] * (now - values[1:]))
     return pressure + _limited(correction, pressure, old, owner, new) * correction
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
     """Return the factor (m,) that keeps corrected pressures within the bounds, equal for all pieces of a domain."""
-    first = np.diff(owner, prepend=-1).nonzero()[0]
+    first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
-    share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0).clip(0, 1)
-    return np.minimum.reduceat(share, np.diff(new.point, prepend=-1).nonzero()[0])[new.point]
+    share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0)
+    return np.minimum.reduceat(np.minimum(np.maximum(share, 0.0), 1.0), new_first)[new.point]

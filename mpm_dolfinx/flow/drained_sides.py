@@ -257,16 +257,16 @@ class SideFeeds(Feeds):
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
-        self._rains = tuple(depth is not None for depth in ponds)
+        self._rains = [depth is not None for depth in ponds]
         self._names, self._before = names, wet.outcome
-        self._contents, self._comm = wet.contents, wet.cut.grid.comm
+        self._at, self._comm = wet.contents.slot(sides.cells), wet.cut.grid.comm
         self._fallen = sides.rain
         self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
         self.settles = bool(self._seeps.any())
         self.linear = not any(self._rains)
         self._drain = wet.drains
-        self._flows, self._nonorthogonal = np.ones(len(sides.cells), dtype=bool), 0.0
+        self._flows, self._nonorthogonal = True, 0.0
         self._share: NDArray[np.float64] | float = 0.0
 
     def _pond(
@@ -303,9 +303,8 @@ class SideFeeds(Feeds):
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
         """Return the faces with the outside pressures of `sides`."""
-        at = self._contents.slot(sides.cells)
-        conductance, inflow = sides.driven(at, flow)
-        offset = flow.deformed(at, sides.offset)
+        at = self._at
+        (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
         if flow.relative is None:
             return OpenFaces(at, conductance, inflow, self._seeps, offset)
         drop = np.zeros(len(at)) if flow.weight is None else offset @ flow.weight
@@ -319,16 +318,16 @@ class SideFeeds(Feeds):
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
         """Return the outflow of the cells.  The non-orthogonal correction is computed at the start of the substep."""
-        flux, counts = self._through(at, fluid), self._counts(at)
+        flux = self._through(at, fluid)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
-        rows = np.array([flux, counts * at.open_by(fluid), np.abs(flux) * self._drain])
+        rows = np.array([flux, self._if_open(at, at.open_by(fluid)), np.abs(flux) * self._drain])
         cells, turnover, gain = sum_by(at.at, rows, len(fluid.pi))
         return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # rain is no gain: steady rain changes no storage
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow by the pressure of the cell."""
-        return sum_by(at.at, self._counts(at) * (1 + self._share) * at.derivative(fluid), len(fluid.pi))
+        return sum_by(at.at, self._if_open(at, (1 + self._share) * at.derivative(fluid)), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
         """Update the active set: seepage faces with outflow become open, others closed; return the count of changes."""
@@ -378,10 +377,10 @@ class SideFeeds(Feeds):
                 out["ponded"][name] = np.array(ponded[i])
         return out
 
-    def _counts(self, at: OpenFaces) -> NDArray[np.bool_]:
-        """Return which faces (m,) are open."""
-        return self._flows | ~at.seeps
+    def _if_open(self, at: OpenFaces, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (m,) of faces, with zeros at closed seepage faces."""
+        return np.where(self._flows | ~at.seeps, values, 0.0) if self.settles else values
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow through each face (m,), m^d/s."""
-        return np.where(self._counts(at), (1 + self._share) * at.outflow(fluid), 0.0) + self._nonorthogonal
+        return self._if_open(at, (1 + self._share) * at.outflow(fluid)) + self._nonorthogonal

@@ -52,6 +52,8 @@ class CellMotion(NamedTuple):
     """Motion of n cells in a step."""
 
     F: NDArray[np.float64]  # deformation gradient (n, d, d)
+    cofactors: NDArray[np.float64]  # of F (n, d, d)
+    ratio: NDArray[np.float64]  # determinant of F (n,)
     moved: NDArray[np.float64]  # displacement (n, d), m
     hoop: NDArray[np.float64] | None  # circumferential stretch (n,); None unless axisymmetric
 
@@ -66,18 +68,13 @@ class Conduction:
     bulk: float  # bulk modulus of the fluid, Pa
     relative: Any = None  # relative conductivities, see `unsaturated.Relative`
 
-    @cached_property
-    def _cofactors(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Cofactors (n, d, d) and determinants (n,) of F of the cells."""
-        return cofactor(self.motion.F), determinant(self.motion.F)
-
     def along(self, dim: int) -> NDArray[np.float64]:
         """Return the mobilities (n, d) along the axes, pulled back to the start of the step."""
         kappa, share = self.mobility.mean[:, None], self.mobility.share
         kappa = kappa.repeat(dim, axis=1) if share is None else kappa * share
         if self.motion is None:
             return kappa
-        (cofactors, ratio), hoop = self._cofactors, self.motion.hoop
+        _, cofactors, ratio, _, hoop = self.motion
         along = kappa / ratio[:, None] * np.add.reduce(cofactors**2, axis=1)
         return along if hoop is None else along * hoop[:, None]
 
@@ -88,18 +85,16 @@ class Conduction:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
         if self.motion is None:
             return kappa
-        (cofactors, ratio), hoop = self._cofactors, self.motion.hoop
+        _, cofactors, ratio, _, hoop = self.motion
         pulled = cofactors[at] @ normal[:, :, None]
         across = kappa / ratio[at] * np.add.reduce(pulled**2, axis=(1, 2))
         return across if hoop is None else across * hoop[at]
 
-    def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray | float:
+    def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
         """Return (distance of centroid) / (distance of pressure position), both from faces (m,) along normals (m, d).
 
         `offset` (m, d), m, are the vectors from the centroids to the faces.
         """
-        if self.mobility.shift is None:
-            return 1.0
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
@@ -145,7 +140,9 @@ class OpenSides:
         The inflow is prescribed, or caused by the outside pressure and gravity.  `at` (m,) are the indices of the cells
         among the filled cells.
         """
-        shape = self.shape * flow.distance_ratio(at, self.normal, self.offset)
+        shape = self.shape
+        if flow.mobility.shift is not None:
+            shape = shape * flow.distance_ratio(at, self.normal, self.offset)
         conductance = flow.across(at, self.normal) * shape
         return conductance, self.given + conductance * self.outer(at, flow)
 
@@ -226,15 +223,16 @@ class CellContents(Keyed):
         centroid, lower, upper = (f.x.array.reshape(-1, d) for f in shapes)
         centroid[filled] = (sums[3 : 3 + d] / area).T - grid.midpoints[filled]
         for target, faces in ((lower, sums[3 + d :: 2]), (upper, sums[4 + d :: 2])):
-            target[filled] = faces.T * grid.sizes(filled) / np.reshape(grid.volumes(filled), (-1, 1))
+            target[filled] = faces.T * grid.sizes(filled) / np.array(grid.volumes(filled)).reshape(-1, 1)
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
         at = grid.midpoints[filled] + centroid[filled]
         self._unit = np.eye(d)
-        self._shapes = np.dstack([grid.shape_gradients(filled, at), grid.shape_values(filled, at)])
+        shapes = [grid.shape_gradients(filled, at), grid.shape_values(filled, at)[:, :, None]]
+        self._shapes = np.concatenate(shapes, axis=2)
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
-        self.open[active] = np.stack([lower[active], upper[active]], axis=2)
+        self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
         """Vectors (c, d), m, from cell midpoints to centroids of material; open fractions (c, d, 2) of faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -279,7 +277,7 @@ class CellContents(Keyed):
             F[rests], moved[rests] = self._unit, 0.0
             if hoop is not None:
                 hoop[rests] = 1.0
-        return CellMotion(F, moved, hoop)
+        return CellMotion(F, cofactor(F), determinant(F), moved, hoop)
 
     @property
     def shape_values(self) -> NDArray[np.float64]:
@@ -451,8 +449,9 @@ class FluxForms:
             moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
             values.append((self.moved, moved if shift is None else moved - shift))
         for f, rows in values:
-            f.x.array.reshape(-1, d)[filled] = rows
-            f.x.scatter_forward()
+            x = f.x
+            x.array.reshape(-1, d)[filled] = rows
+            x.scatter_forward()
         if self.relative is not None:
             self.relative.set_borders(contents, flow, *(f.x.array.reshape(-1, d) for f in (self.centroid, self.moved)))
         return mobility

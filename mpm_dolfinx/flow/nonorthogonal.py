@@ -188,11 +188,9 @@ class NonorthogonalFlow(NamedTuple):
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
     """Return for each face (m,) whether the condition's faces in its cell are not opposite the centroid on average."""
-    _, at = np.unique(np.stack([sides.number, sides.cells]), axis=1, return_inverse=True)
-    at, size = at.ravel(), np.linalg.norm(sides.area, axis=1)
-    count = int(at.max(initial=-1)) + 1
-    off = _along(sides) / grid.sizes(sides.cells)
-    mean = sum_by(at, (size[:, None] * off).T, count) / sum_by(at, size, count)
+    faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
+    size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
+    mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))
     return (np.abs(mean) > ALONG).any(axis=0)[at]
 
 

@@ -52,7 +52,7 @@ from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
-from mpm_dolfinx.forms.point_forms import CellSums, FacetForm, FacetSum, FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
@@ -255,6 +255,7 @@ class StorageSystem:
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
+        self._uniform = self._over_uniform() if fluxes.relative is None else None
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # also of a cell without faces
         pattern = self.L
@@ -267,12 +268,13 @@ class StorageSystem:
     @property
     def gravity(self) -> FacetSum | None:
         """Form of the fluxes by p and the fluid's weight between cells of the same soil; None without weight."""
-        return self._over_uniform(self._forms.fluxes.gravity)
+        return (self._uniform or self._over_uniform())[1]
 
-    def _over_uniform(self, form: FacetForm | None) -> FacetSum | None:
-        """Return a form over the faces between cells of the same soil, see `Relative`."""
-        relative = self._forms.fluxes.relative
-        return form and form.on(self._facets if relative is None else relative.uniform(self._facets))
+    def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
+        """Return forms over the faces between cells of the same soil, see `Relative`: fluxes by p; see `gravity`."""
+        fluxes, facets = self._forms.fluxes, self._facets
+        facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
+        return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the grid positions of this process's unknowns, and an empty array, because no pressure is fixed."""
@@ -324,7 +326,7 @@ class StorageSystem:
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
             borders = relative.set_pressures(self._forms.p.x.array, force)
-        if (flux := self._over_uniform(self._forms.fluxes.flux)) is not None:
+        if (flux := (self._uniform or self._over_uniform())[0]) is not None:
             flux.assemble_matrix(self.T)
         if borders is not None:
             borders.add_slopes(self.T, self.unknowns)
@@ -406,9 +408,9 @@ class StorageProblem:
         if forms.retains:  # dry pores hardly couple both balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
             tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
-        softest = contents.softest(softness) if forms.softens else np.ones(1)
+        softest = contents.softest(softness) if forms.softens else np.array([1.0])
         known = [(tau * squared > least).any(), (softest * tau * squared > least).any() and softest.max() > 1]
-        somewhere = over_all(forms.grid.comm, np.array([*known, any(one.settles for one in feeds)], dtype=float)) > 0
+        somewhere = over_all(forms.grid.comm, np.array([*known, any([one.settles for one in feeds])], dtype=float)) > 0
         self.damped, flows, self._settles = somewhere.tolist()
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
@@ -502,9 +504,10 @@ class StorageProblem:
         between, difference = 0.0, np.zeros(sum(sides))
         if outflow.nonorthogonal is not None:
             between, difference = outflow.nonorthogonal(p, self.forms.bulk)
-        parts = np.split(difference, np.cumsum(sides)[:-1])
-        for one, at, part in zip(self._feeds, outflow.at, parts, strict=False):
-            one.begin(at, fluid, part)
+        start = 0
+        for one, at, count in zip(self._feeds, outflow.at, sides, strict=True):
+            one.begin(at, fluid, difference[start : start + count])
+            start += count
         return between
 
     @property
@@ -576,13 +579,13 @@ class StorageProblem:
             system.D.multAdd(step, r, r)
         if self._softer is not None:
             self._softer.multAdd(step, r, r)
-        rates = self._rates(outflow)
-        now = rates.integrated(self.dt)
-        mass = r.array_r + now.cells + before.cells
+        rates, dt = self._rates(outflow), self.dt
+        mass = r.array_r + dt * rates.cells + before.cells
         r.array_w[:] = mass / density
         # bound of rounding errors: of volumes, and of fluxes that cancel
-        round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
-        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.net + before.net
+        round_off = 8 * EPSILON * (self._contents.volume + dt * rates.turnover + before.turnover)
+        exchanged, gain = np.abs(change) + dt * rates.gain + before.gain, change + dt * rates.net + before.net
+        rows = exchanged, round_off, np.abs(mass), gain
         return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
@@ -616,7 +619,7 @@ class StorageProblem:
 
         Volumes refer to the density at mid-step, as in `change`.  `rates` are the rates at the end of the substep.
         """
-        return (-rates.integrated(self.dt).cells - self._before.cells) / self._density
+        return (-self.dt * rates.cells - self._before.cells) / self._density
 
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()

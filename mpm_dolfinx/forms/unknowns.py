@@ -30,7 +30,8 @@ class Unknowns:
         self._x = x
         self._space = space = function.function_space
         self.comm = space.mesh.comm
-        owned = space.dofmap.index_map.size_local * space.dofmap.bs
+        dofmap = space.dofmap
+        owned = dofmap.index_map.size_local * dofmap.bs
         number = np.full(len(function.x.array), -1, dtype=np.int32)
         self.owned = dofs[dofs < owned]
         """Unrolled local degree of freedom of each entry of a vector."""
@@ -71,10 +72,10 @@ class Unknowns:
 
     def vector(self) -> PETSc.Vec:
         """Return a new vector of zeros."""
-        v = PETSc.Vec().createMPI((self.size, None), comm=self.comm)
         if self.comm.size == 1:
-            v.destroy()
             v = PETSc.Vec().createSeq(self.size, comm=self.comm)
+        else:
+            v = PETSc.Vec().createMPI((self.size, None), comm=self.comm)
         v.set(0.0)
         return v
 
@@ -95,7 +96,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A = PETSc.Mat().create(rows.comm)
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
-    length = np.broadcast_to(row_length, (rows.size,)).astype(PETSc.IntType)
+    length = np.zeros(rows.size, dtype=PETSc.IntType) + np.asarray(row_length, dtype=PETSc.IntType)
     elsewhere = np.minimum(length, columns.global_size) if rows.comm.size > 1 else 0
     A.setPreallocationNNZ((np.minimum(length, columns.size), elsewhere))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)

@@ -210,7 +210,7 @@ def of_cells(name: str) -> cached_property:
 
 def of_places(name: str) -> property:
     """Return a property of a grid that is a current position in its `Cells`."""
-    return property(lambda grid: getattr(grid._of_process.at, name))
+    return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
 def of_spacing(name: str) -> property:
@@ -527,7 +527,7 @@ class Grid:
     @property
     def cells(self) -> int:
         """Number of cells of one copy."""
-        return int(np.prod(self.shape))
+        return prod(self.shape.tolist())
 
     @property
     def nodes(self) -> int:
@@ -608,7 +608,7 @@ class Grid:
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the indices along the axes and the index of the copy (n, d + 1) of local cells (n,)."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
-        return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
+        return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if not on this process."""
@@ -623,7 +623,7 @@ class Grid:
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
         """Return which x (from the base) are outside the grid by more than `tolerance` cell sizes plus rounding."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
-        tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / least
+        tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
         for a in range(self.dim):
             y = (x[:, a] - self.low[a]) / self.h[a] if self.even else cells[:, a]

@@ -311,8 +311,9 @@ class SceneMaterials:
         """
         each, shapes = [], set()
         for i in self._used:
-            rows = (points.material == i).nonzero()[0]
-            found = np.asarray(value(self._at(points, i, rows), *[column[rows] for column in columns]))
+            rows = (points.material == i).nonzero()[0] if len(self._used) > 1 else np.arange(len(points.id))
+            at = self._at(points, i, rows) if self._fields[i] else self.materials[i]
+            found = np.asarray(value(at, *[column[rows] for column in columns]) if columns else value(at))
             each.append((rows, found))
             shapes.add(found.shape[bool(columns or self._fields[i]) :])
         out = np.zeros((len(points.id), *(shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes))))
@@ -364,7 +365,7 @@ class SceneMaterials:
         """Names of material constants, each with a material that has it."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
-    @property
+    @cached_property
     def field_names(self) -> list[str]:
         """Names of material constants that are functions of position."""
         return list(dict.fromkeys(name for i in self._used for name in self._fields[i]))
@@ -374,7 +375,7 @@ class SceneMaterials:
         """Whether a law has a state."""
         return any(law.state for law in self.laws)
 
-    @property
+    @cached_property
     def state_names(self) -> list[str]:
         """Names of the laws' state variables."""
         return list(dict.fromkeys(name for law in self.laws for name in law.state))

@@ -31,7 +31,7 @@ from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatric
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import among, sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -225,7 +225,7 @@ class MomentumForms:
             solve()
         else:
             self.dilatation.update(data, solve)
-        return self.summed(0, [add, *(one.takes_up for one in loads)])
+        return self.summed(0, [add, *[one.takes_up for one in loads]])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K; the caller finalises K."""
@@ -322,7 +322,7 @@ class MomentumSystem:
         """Norm of the rounding errors in a connected part, N, if all its unknowns had the error of this unknown."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
-        held = np.setdiff1d(active, dofs)
+        held = active[~among(active, dofs)]
         self.held = Unknowns(forms.u, held, forms.grid.node_x)
         """Degrees of freedom that walls of the grid fix."""
         self.held_residual = self.held.vector()
@@ -602,7 +602,7 @@ class MomentumProblem:
                 K.axpy(1.0, zeros, pattern.UNKNOWN)
             if (coupling := one.coupling(self.at)) is not None:
                 K.axpy(1.0, coupling, pattern.SUBSET_NONZERO_PATTERN)
-        shares = np.broadcast_to(firmness, self.system.parts.count)
+        shares = firmness + np.zeros(self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():
                 K.axpy(shares[0], self.system.firm, pattern.SUBSET_NONZERO_PATTERN)

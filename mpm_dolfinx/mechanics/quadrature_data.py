@@ -168,7 +168,8 @@ class QuadraturePoints:
         even = {name: values for name, values in self._changing(points).items() if name not in within}
         fields = {**self._constant(cut, points), **{name: cut.to_cells(values) for name, values in even.items()}}
         fields |= {name: cut.pieces_to_cells(values) for name, values in within.items()} | self._own(cut, points)
-        fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
+        if self._scene.retentions:
+            fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         apart = self._extended and self._locks
         of_points = PointData(self.pieces, places.pieces, weight, fields) if apart else None

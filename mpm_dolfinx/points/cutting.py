@@ -132,16 +132,17 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     As in `cut`, inverted simplices count with positive volume.
     """
-    return np.concatenate([_centroids(corners[part]) for part in _chunks(len(corners), corners.shape[2])])
+    chunks = _chunks(len(corners), corners.shape[2])
+    return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
 
 
 def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
     volume, middle = np.abs(simplex_volumes(v)), v[-1]
-    whole, moment = volume.sum(axis=0), np.zeros_like(middle)
+    whole, moment = np.add.reduce(volume), np.zeros(middle.shape)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
-        moment += share * (v[simplex].sum(axis=0) / len(simplex) - middle)
-    return (middle + np.divide(moment, whole, out=np.zeros_like(moment), where=whole > 0)).T.copy()
+        moment += share * (np.add.reduce(v[simplex]) / len(simplex) - middle)
+    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole > 0)).T.copy()
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
@@ -175,6 +176,8 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
     The pieces.  Pieces below 1e-12 of their domain are left out; the fractions of every domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
+    if len(chunks) == 1:
+        return _cut(grid, corners, second, faces)
     parts = [_cut(grid, corners[chunk], second, faces) for chunk in chunks]
     for chunk, part in zip(chunks, parts, strict=True):
         part.point += chunk.start
@@ -228,7 +231,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
         volume = simplex_volumes(v)
     # segments or triangles (d, d, m): vertices and coordinates first, for fast loops in numpy
     s = np.concatenate([v[facet] for facet in _FACETS[d][:, -1]], axis=2)
-    outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), len(_FACETS[d]))
+    outward, owner = _area_vectors(s), np.arange(len(corners))[None].repeat(len(_FACETS[d]), axis=0).ravel()
     # an inverted simplex counts with positive volume: its negative volume is subtracted twice
     simplex, folded = np.nonzero(volume < 0)
     if len(folded):
@@ -276,12 +279,13 @@ class _Slots:
         top = (grid.shape - 1)[:, None]
         self.low = np.minimum(np.maximum(np.floor(y.min(axis=0)).astype(np.int64), 0), top)
         self.high = np.minimum(np.maximum(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low), top)
-        span = self.high - self.low + 1
-        stop = np.cumsum(span.prod(axis=0))
+        self._span = span = self.high - self.low + 1
+        self._stride = np.array([np.multiply.reduce(span[axis + 1 :]) for axis in range(len(span))])
+        count = self._stride[0] * span[0]
+        stop = count.cumsum()
         self.size = int(stop[-1]) if len(stop) else 0
-        self.point = np.arange(y.shape[2]).repeat(span.prod(axis=0))
-        self._stride = np.cumprod(np.concatenate([np.ones_like(span[:1]), span[:0:-1]]), axis=0)[::-1]
-        self._start, self._span = stop - span.prod(axis=0), span
+        self.point = np.arange(y.shape[2]).repeat(count)
+        self._start = stop - count
         number = np.arange(self.size) - self._start[self.point]
         self._place = number // self._stride[:, self.point] % span[:, self.point]
         self.cell = self.low[:, self.point] + self._place
@@ -297,7 +301,7 @@ class _Slots:
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """Return, for each slot, the sum of the values of the slots further along an axis in the same column."""
         out = np.zeros(self.size)
-        for steps in range(1, int(self._span[axis].max(initial=1))):
+        for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
             out[has] += values[has + steps * self._stride[axis][self.point[has]]]
         return out
@@ -340,13 +344,14 @@ def _sum(
         return (x[:, a] * x[:, b]).sum(axis=0)
 
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
-    shadow = total(area[0])
-    beyond = slots.beyond(shadow, 0)
-    volume = total(area[0] * sums[0] / d) + beyond
-    moments = [total(products / 2 * (sums[0] ** 2 + pair(0, 0))) + beyond / 2]
+    rows = [area[0], area[0] * sums[0] / d, products / 2 * (sums[0] ** 2 + pair(0, 0))]
     for a in range(1, d):
-        within = total(products * (sums[0] * sums[a] + pair(0, a)))
-        moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
+        rows += [products * (sums[0] * sums[a] + pair(0, a)), area[0] * sums[a] / d]
+    shadow, volume, moment, *others = sum_by(slot, np.array(rows), slots.size)
+    beyond = slots.beyond(shadow, 0)
+    volume, moments = volume + beyond, [moment + beyond / 2]
+    for within, along in zip(others[::2], others[1::2], strict=True):
+        moments.append(within + slots.beyond(along, 0))
     pairs = [(1, 2), (0, 2), (0, 1)] if d == 3 else [(0, 1)] * second
     pairs += [(a, a) for a in range(d)] * second
     uneven = _products(pairs, x, sums, area[0], pair, total, slots)
@@ -371,7 +376,7 @@ def _sum(
     for a, section in enumerate(sections):
         shadow = total(area[a]) if a else shadow
         beyond = slots.beyond(shadow, a)
-        lower, upper = (total(area[a], chosen) for chosen in ends[a])
+        lower, upper = total(area[a], ends[a][0]), total(area[a], ends[a][1])
         # areas of the body's sections just above the lower and just below the upper face
         np.multiply([(beyond + shadow - lower)[kept], (beyond + upper)[kept]], h.prod(axis=0) / h[a], out=section)
 
@@ -527,11 +532,11 @@ def cut_faces(
         """Return positions (n, d), m, relative to the base."""
         return grid.low + grid.h * y if grid.even else y
 
-    points = np.einsum("qk,kam->qam", _RULES[d], s)
-    middle = np.tile(place(s[:, :d].mean(axis=0).T), (len(points), 1))
-    points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
+    points = (_RULES[d] @ s.reshape(d, -1)).reshape(len(_RULES[d]), *s.shape[1:])
     count = len(_RULES[d])
-    face, share = np.tile(owner, count), np.tile(share / count, count)
+    middle = place(np.add.reduce(s[:, :d]).T / d)[None].repeat(count, axis=0).reshape(-1, d)
+    points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
+    face, share = (rows[None].repeat(count, axis=0).ravel() for rows in (owner, share / count))
     return face, place(points[:, :d]), points[:, d:], share, middle
 
 
@@ -607,23 +612,22 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
     """Slice simplices, in positions for slicing, by the grid planes of an axis until no simplex crosses a plane."""
     done_s, done_owner = [], []
     while True:
-        t = s[:, axis]
-        plane = np.floor(t.min(axis=0)) + 1 if grid.even else grid.next_plane(axis, t.min(axis=0))
-        crossing = t.max(axis=0) > plane
+        least, most = np.minimum.reduce(s[:, axis]), np.maximum.reduce(s[:, axis])
+        plane = np.floor(least) + 1 if grid.even else grid.next_plane(axis, least)
+        crossing = most > plane
         if not crossing.any():
             break
-        done_s.append(s.compress(~crossing, axis=2))
-        done_owner.append(owner[~crossing])
-        below, below_owner, s, owner = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
-        done_s.append(below)
-        done_owner.append(below_owner)
+        below, below_owner, *above = cut_at(s.compress(crossing, axis=2), owner[crossing], axis, plane[crossing])
+        done_s += [s.compress(~crossing, axis=2), below]
+        done_owner += [owner[~crossing], below_owner]
+        s, owner = above
     return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
 
 
 def cut_at(s, owner, axis: int, plane):
     """Cut each simplex at a plane; return the parts below and above it with their owners."""
     order = s[:, axis].argsort(axis=0)
-    s = np.take_along_axis(s, order[:, None], axis=0)
+    s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
     dim = len(s) - 1
     parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}
@@ -638,12 +642,7 @@ def cut_at(s, owner, axis: int, plane):
         for where, simplices in _CUTS[dim][k].items():
             parts[where] += [np.array([points[p] for p in simplex]) for simplex in simplices]
             owners[where] += [owner[chosen]] * len(simplices)
-    return (
-        np.concatenate(parts["below"], axis=2),
-        np.concatenate(owners["below"]),
-        np.concatenate(parts["above"], axis=2),
-        np.concatenate(owners["above"]),
-    )
+    return [np.concatenate(rows[where], axis=-1) for where in ("below", "above") for rows in (parts, owners)]
 
 
 def _on_plane(a, b, axis: int, plane):

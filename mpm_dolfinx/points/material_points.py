@@ -176,12 +176,12 @@ class MaterialPoints:
         """Deformation gradient used by laws (n, 3, 3); in plane strain without an out-of-plane stretch (n, 2, 2)."""
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
-    def strained(self, F: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with another deformation gradient F, in the shape of `F_of_laws`."""
+    def strained(self, F: NDArray[np.float64], **others: NDArray[np.float64]) -> MaterialPoints:
+        """Return the points with another F, in the shape of `F_of_laws`, and with the fields `others`."""
         if ACROSS not in self.data:
-            return replace(self, F=F)
+            return replace(self, F=F, **others)
         F, across = in_plane(F)
-        return replace(self, F=F, data={**self.data, ACROSS: across})
+        return replace(self, F=F, data={**self.data, ACROSS: across}, **others)
 
     @property
     def displacement(self) -> NDArray[np.float64]:

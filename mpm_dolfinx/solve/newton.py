@@ -95,7 +95,7 @@ class Errors:
     @cached_property
     def worst(self) -> float:
         """The largest residual of all parts."""
-        return float(self.each.max(initial=0.0))
+        return float(np.maximum.reduce(self.each, initial=0.0))
 
 
 def solve_substep(
@@ -209,7 +209,9 @@ class Newton:
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
         forms, active = momentum.forms, momentum.forms.active.now
-        self._functions = [(forms.u, active.dofs)] + ([(storage.forms.p, active.cells)] if storage is not None else [])
+        self._vectors = [(forms.u.x, active.dofs)]
+        if storage is not None:
+            self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
         """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
@@ -311,7 +313,7 @@ class Newton:
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
-        return [f.x.array[rows] for f, rows in self._functions]
+        return [x.array[rows] for x, rows in self._vectors]
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
@@ -321,9 +323,9 @@ class Newton:
 
     def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
         """Set (u, p) to an iterate."""
-        for (f, rows), values in zip(self._functions, iterate, strict=True):
-            f.x.array[rows] = values
-            f.x.scatter_forward()
+        for (x, rows), values in zip(self._vectors, iterate, strict=True):
+            x.array[rows] = values
+            x.scatter_forward()
 
     def _stable(self, found: Errors) -> Errors:
         """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
@@ -406,13 +408,14 @@ class Newton:
             fluid, size = None, 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
-                exchanged, size = fluid.exchanged, float(fluid.off.sum())
+                exchanged, size = fluid.exchanged, float(np.add.reduce(fluid.off))
                 p = relative(fluid.off, exchanged, fluid.round_off)
                 error_p = relative(fluid.off, np.maximum(exchanged, fluid.round_off / self._scheme.tolerance))
         if first and not np.isfinite(norm := r.norm() + size):
             where = "storage, from a source" if np.isfinite(r.norm()) else "momentum, from a law or term"
             raise NotConverged(f"{norm:g} in the residual of the {where}, must be finite")
-        self.report.history.append((float(error_u.max(initial=0.0)), float(error_p.max(initial=0.0))))
+        largest = np.maximum.reduce(np.array([error_u, error_p]), axis=1, initial=0.0)
+        self.report.history.append(tuple(largest.tolist()))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:

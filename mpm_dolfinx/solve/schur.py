@@ -59,16 +59,8 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 class SchurComplement:
     """Matrix-free Schur complement S = C + B K^-1 B^T for PETSc's Krylov solvers.
 
-    Parameters
-    ----------
-    storage
-        The matrices B and C.
-    solve
-        Solver for systems with K.
-    f, v
-        Work vectors: forces B^T x, and displacements K^-1 f.
-    slopes
-        Derivative of the fluxes with respect to displacements, if the tangent includes it.
+    storage: the matrices B and C; solve: solver for systems with K; f, v: work vectors for the forces B^T x and the
+    displacements K^-1 f; slopes: derivative of the fluxes with respect to displacements, if the tangent includes it.
     """
 
     storage: StorageSystem

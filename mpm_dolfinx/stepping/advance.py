@@ -64,16 +64,9 @@ Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.
 class Motion:
     """Motion of a scene's material points in a step.
 
-    Parameters
-    ----------
-    materials
-        The materials of the scene.
-    bodies
-        All bodies of the scene.
-    momentum, storage
-        Forms of the two balances, with u and p of a solved step; storage is None without fluid.
-    keeps_volumes
-        Whether yielded domains keep the volumes of their points, see `kept_volumes`.
+    materials: the materials of the scene; bodies: all bodies of the scene; momentum, storage: forms of the two
+    balances, with u and p of a solved step; storage is None without fluid; keeps_volumes: whether yielded domains keep
+    the volumes of their points, see `kept_volumes`.
     """
 
     def __init__(
@@ -141,7 +134,7 @@ class Motion:
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
-                points = replace(state.points.strained(F), x=x, corners=corners)
+                points = state.points.strained(F, x=x, corners=corners)
                 keeps, folded = on_grid.valid(points, loads), 0
             self._check_volumes(points, cut)
             if carried is not None:
@@ -149,7 +142,8 @@ class Motion:
                 moved = np.where(keeps & stays, 0.0, cut.moved(points, part, count)[part])
                 points = replace(points, data=points.data | carried(moved))
             points = self._dried(points, on_grid, data)
-            points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
+            if (data_now := self._materials.updated_state(points, state.points, t - state.t)) is not points.data:
+                points = replace(points, data=data_now)
             if self.keeps_volumes:
                 points = self._corrected(points, state, loads, keeps & stays)
             carried = None
@@ -158,18 +152,17 @@ class Motion:
                 x = on_grid.of_pieces(state, "x", cut.pieces.x)
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
-                points = replace(points, pressure=self.pressures(on_grid, state.stage, t, nodal))
-                ids = points.id[cut.pieces.point]
+                ids, defect = points.id[cut.pieces.point], {}
                 of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and net_inflow is not None:
                     defect = self._volume_defect(state, points, on_grid, data.of_points, net_inflow, keeps)
-                    points = replace(points, data=points.data | defect)
+                now = self.pressures(on_grid, state.stage, t, nodal)
+                points = replace(points, pressure=now, data=points.data | defect)
             _check_inside(cut, points, t, report)
         stays = stays and not (self._materials.retentions and callable(state.stage.conditions["gravity"]))
-        stay = Stay(cut.points)
-        trend = self._followed(state, points, t - state.t) if self._trends else None
-        new = replace(state, t=t, points=points, pieces=carried, stay=stay, trend=trend)
+        new = {"t": t, "points": points, "pieces": carried}
+        new["trend"] = self._followed(state, points, t - state.t) if self._trends else None
         keeps = keeps & stays
         again = [not keeps.all()]
         if self._storage is not None:
@@ -178,14 +171,11 @@ class Motion:
         if report is not None:
             report.first = np.multiply(report.first, again)
         if not any(again):
-            return new, folded
-        new = replace(self.left_grid(new, on_grid), held=None, rest=None)
-        if some:
-            kept = {name: self._kept(getattr(state, name), on_grid, keeps) for name in ("held", "rest")}
-            if carried is not None:
-                kept["pieces"] = replace(new.pieces, of_cell=carried.of_cell, start=carried.start)
-            new = replace(new, stay=replace(stay, keeps=keeps), **kept)
-        return new, folded
+            return replace(state, **new, stay=Stay(cut.points)), folded
+        if carried is not None:
+            new["pieces"] = self._left(carried, points, state.stage, t, on_grid, some)
+        kept = {name: self._kept(getattr(state, name), on_grid, keeps) if some else None for name in ("held", "rest")}
+        return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), folded
 
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
         """Return the trend of the points after a step of dt (s)."""
@@ -193,8 +183,9 @@ class Motion:
         change, gradient_change = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
         pressure = (points.pressure - state.points.pressure)[:, None] if self._storage is not None else change[:, :0]
         rates = np.concatenate([change, gradient_change, pressure], axis=1)[:, None] / dt
-        lengths, past = ([], rates[:, :0]) if before is None else (before.lengths[:2], before.rates[:, :2])
-        return Trend(np.append(dt, lengths), np.concatenate([rates, past], axis=1))
+        if before is None:
+            return Trend(np.array([dt]), rates)
+        return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
         """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
@@ -207,19 +198,21 @@ class Motion:
         grid, pieces = cut.grid, on_grid.data.pieces
         places, (n, d) = pieces.places, points.x.shape
         F, ratio = points.F[:, :d, :d], seconds / first if first else 0.0
-        change = state.trend.over(seconds, implicit) - ratio * state.trend.over(first, implicit=True)
+        change = state.trend.over(seconds, implicit, first)
         slope = change[:, d : d + d * d].reshape(n, d, d) @ cofactor(F).swapaxes(1, 2) / determinant(F)[:, None, None]
         origin = change[:, :d] - (slope @ points.x[:, :, None])[:, :, 0]
         rows = np.concatenate([origin, slope.reshape(n, d * d), change[:, d + d * d :]], axis=1)
-        rows = pieces.volume * np.concatenate([np.ones((1, len(pieces.volume))), cut.to_cells(rows).T])
-        volume, *sums = sum_by(places.slots, rows, len(places.filled))
-        moved, slope = np.array(sums[:d]), np.reshape(sums[d : d + d * d], (d, d, -1)).transpose(2, 1, 0)
+        rows = np.concatenate([pieces.volume[None], pieces.volume * cut.to_cells(rows).T])
+        sums = sum_by(places.slots, rows, len(places.filled))
+        volume, sums = sums[0], sums[1:]
+        moved, slope = sums[:d], sums[d : d + d * d].reshape(d, d, -1).transpose(2, 1, 0)
         moved = moved[:, :, None] + (grid.node_x[grid.cell_nodes[places.filled]] @ slope).transpose(2, 0, 1)
         whole, *moved = self._momentum.at_nodes(places.filled, [volume[:, None], *moved])
         out = [(np.array(moved) / np.where(whole > 0, whole, 1.0)).T.ravel()]
         out[0] += ratio * self._momentum.u.x.array[self._momentum.active.now.dofs]
         if self._storage is not None:
-            p, p_n = (f.x.array[self._momentum.active.now.cells] for f in (self._storage.p, self._storage.p_n))
+            cells = self._momentum.active.now.cells
+            p, p_n = self._storage.p.x.array[cells], self._storage.p_n.x.array[cells]
             out.append(p_n + ratio * (p - p_n))
             out[1][: len(volume)] += sums[-1] / volume  # owned cells come first; Newton's method updates ghosts
         return out
@@ -346,7 +339,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
+        return points.strained(F, corners=corners, x=centroids(corners)), keeps, folded
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n, 2^d, d) of components of corners: neither prescribed by conditions nor fixed by walls."""
@@ -414,16 +407,10 @@ class Motion:
             return {"owed": defect, "due": np.zeros(len(points))}
         part, count = on_grid.parts
         share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
-        mean = self._means(part, count, points.volume0 * ~none, defect) * self._sealed(state, on_grid, pieces)
+        weight = points.volume0 * ~none
+        total, whole = over_all(cut.grid.comm, sum_by(part, np.array([weight * defect, weight]), count))
+        mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * self._sealed(state, on_grid, pieces)
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
-
-    def _means(
-        self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the weighted mean (count,) of the values of each part's points; zero for parts without points."""
-        sums = np.stack([sum_by(part, column, count) for column in (weight * values, weight)])
-        total, whole = over_all(self._momentum.grid.comm, sums)
-        return np.divide(total, whole, out=np.zeros(count), where=whole > 0)
 
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
         """Return which parts (count,) have no open sides, and no sources at the end of the step."""
@@ -462,20 +449,24 @@ class Motion:
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state in which points store the pressures of their pieces: the next step resets the grid."""
-        carried, points = state.pieces, state.points
-        if self._storage is not None:
-            with _compat.Timer("remap"):
-                pieces = on_grid.cut.pieces
-                store = self._materials.storage(points) * points.volume0 * points.J
-                on_grid.set_pressures(carried.of_cell)
-                water = on_grid.pore_water(points)
-                at_rest = None if water is None else self._at_rest(state.stage, state.t, None)
-                pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t, water, at_rest
-                )
-                leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": None, "start": None}
-                carried = replace(carried, **leaves)
-        return replace(state, pieces=carried, stay=None)
+        pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid, False)
+        return replace(state, pieces=pieces, stay=None)
+
+    def _left(
+        self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
+    ) -> PiecePressures:
+        """Return the pieces at time t, s, with pressures to be moved; some: whether other pieces stay."""
+        with _compat.Timer("remap"):
+            pieces = on_grid.cut.pieces
+            store = self._materials.storage(points) * points.volume0 * points.J
+            on_grid.set_pressures(carried.of_cell)
+            water = on_grid.pore_water(points)
+            at_rest = None if water is None else self._at_rest(stage, t, None)
+            pressure, slope, bounds = on_grid.pressures_at_pieces(
+                self._reconstruction, pieces.fraction * store[pieces.point], stage, t, water, at_rest
+            )
+        none = {} if some else {"of_cell": None, "start": None}
+        return replace(carried, pressure=pressure, slope=slope, bounds=bounds, **none)
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:

@@ -138,7 +138,7 @@ def flight_of(start: Start) -> Flight | None:
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
     """Return whether Newton's method may start from extrapolated motion: if soil yields, or in quasi-static contact."""
     momentum = scene.momentum
-    return not momentum.elastic or (momentum.inertia is None and any(one.touches for one in loads))
+    return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
 
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:

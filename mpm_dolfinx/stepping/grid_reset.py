@@ -25,7 +25,7 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.borders import Borders
 from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
-from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
+from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, nonorthogonal_facets, off_middle
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
@@ -99,9 +99,11 @@ class OnGrid(Keyed):
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
         """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the circumference, N/m."""
-        np.maximum.at(self.stiffness, cut.cells, rows)
+        order = rows.argsort(kind="stable")
+        self.stiffness[cut.cells[order]] = rows[order]  # the largest value of a cell is assigned last
         self.contents = None
         self._mixed, self._borders = None, None
+        self._sides: Latest[OpenSides] = Latest()
         if storage is not None:
             brought = PieceContents(
                 cells=cut.cells,
@@ -161,9 +163,10 @@ class OnGrid(Keyed):
         if not state.stays:
             bulk = self._storage.bulk
             retentions, new = self._quadrature.materials.retentions, self.cut.pieces
-            rest = np.zeros(self.cut.grid.dim) if retentions is None else retentions.weight.value
-            old = state.pieces.potentials(bulk).less(rest)  # keeps hydrostatic states, although S is not linear
-            carried = transport(old, self.cut.points, new) + new.x @ rest
+            old, rest = state.pieces.potentials(bulk), None if retentions is None else retentions.weight.value
+            # without hydrostatic pressures, because the storage of unsaturated soil is not linear
+            carried = transport(old if rest is None else old.less(rest), self.cut.points, new)
+            carried = carried if rest is None else carried + new.x @ rest
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
             p = pressure_of(self._means(carried), bulk)
@@ -273,7 +276,7 @@ class OnGrid(Keyed):
         store = self.cut.pieces_to_cells(store)
         weight = np.where(contents.total(store)[at] > 0, store, self.weight)
         total = contents.total(weight)
-        origin = np.stack([contents.total(weight * x) / total for x in offset.T], axis=1)
+        origin = (contents.total(weight * offset.T) / total).T
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.add.reduce(slope[at] * (offset - origin[at]), axis=1), seen.p[contents.filled]
@@ -331,8 +334,10 @@ class OnGrid(Keyed):
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
-        sides = open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)
-        sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        place = lambda: open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)  # noqa: E731
+        sides = self._sides((stage, t), place, self.cut.grid.comm)
+        if bulk < np.inf:
+            sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
         cells, seen = self.cells, np.zeros(len(p))
         seen[cells] = mass_potential(p[cells], bulk)
         if at_rest is not None:
@@ -597,7 +602,7 @@ class Assembled(Keyed):
         contents = self._on_grid.contents
         grid = self._on_grid.cut.grid
         u = self._nodal
-        varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
+        varies = (t,) if any([one.varies for one in self._stage.feeding]) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may depend on time
         wet = Wet(on_grid.cut, at, contents, t, data.of_points, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
@@ -609,15 +614,16 @@ class Assembled(Keyed):
             together = [grid.comm] if mixture else []  # without pressures the key is equal on all processes
             return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
-        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
-            gradients = None if self._off is None else self._gradients(where, fit)
-            off = gradients and (self._off, gradients, sides)
-            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
-
         def fit() -> Gradients | None:
             needed = self._off.some or off_middle(sides, grid).any()
             return Gradients(contents, sides) if needed else None
+
+        where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
+        gradients = None if self._off is None else self._gradients(where, fit)
+        off = gradients and (self._off, gradients, sides)
+
+        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
+            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
         mixture = ()
         if self._by_pressure is not None:
@@ -628,15 +634,15 @@ class Assembled(Keyed):
             return feeds, lambda begins: of_cut
         rests = on_grid.rests(state) if not self._varies else None
 
-        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
-            return set_fluxes(mobility(begins), contents.motion(nodal, rests))
-
         # a substep begins at the end of the previous one
-        at_u = (data.pieces.key, weight, *varies)
+        at_u, steady = (data.pieces.key, weight, *varies), None if self._varies else mobility(True)
+
+        def at_present(nodal: NDArray[np.float64], begins: bool) -> Outflow:
+            return set_fluxes(steady or mobility(begins), contents.motion(nodal, rests))
 
         def outflow(begins: bool) -> Outflow:
             nodal = contents.nodal(u)
-            return self._outflow((*at_u, nodal), lambda: at_present(nodal, begins), grid.comm)
+            return self._outflow((*at_u, nodal), partial(at_present, nodal, begins), grid.comm)
 
         return feeds, outflow
 

@@ -105,12 +105,18 @@ class Trend:
     def __post_init__(self):
         _freeze(vars(self))
 
-    def over(self, seconds: float, implicit: bool = False) -> NDArray[np.float64]:
-        """Return changes (n, ...) in a time (s), by the polynomial through the last states; implicit: as by Euler."""
-        order = np.arange(1, len(self.lengths) + 1)
-        ends = -self.lengths.cumsum()[:, None] / self.lengths[0]
-        shares = np.linalg.solve((ends**order).T, (seconds / self.lengths[0]) ** order * (order if implicit else 1))
-        return np.tensordot(self.rates, -self.lengths * shares[::-1].cumsum()[::-1], (1, 0))
+    def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
+        """Return changes (n, ...) in a time (s), by the polynomial through the last states; implicit: as by Euler.
+
+        If first > 0, a first implicit substep of this length (s), continued at its rate, is subtracted.
+        """
+        order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
+        ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
+        if first:
+            powers = powers - seconds / first * (first / last) ** order * order
+        shares = np.linalg.solve((ends**order).T, powers)
+        weights = -self.lengths * shares[::-1].cumsum()[::-1]
+        return np.add.reduce(self.rates * weights[:, None], axis=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

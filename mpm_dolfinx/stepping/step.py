@@ -24,7 +24,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
-    start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
+    start, *gravity = [stage.gravity_at(t) for t in [state.t, *times]]
     if dt > 0:
         scene.look_at([start, *gravity])
     state, renewed = scene.for_reset(scene.followed(state), dt > 0)
