@@ -59,8 +59,11 @@ def published(aspect: float) -> float:
     return float(np.interp(aspect, (1.8, 2.8), (0, 1)) * (1.9 * aspect ** (2 / 3) - 1.2 * aspect) + 1.2 * aspect)
 
 
-def column(aspect: float, cells: int, grain: float = GRAIN) -> mpm.Simulation:
-    """Return a column at rest, 1 m wide, with a number of cells over the width; grain: grain size, m."""
+def column(aspect: float, cells: int, grain: float = GRAIN, renewal: bool = False) -> mpm.Simulation:
+    """Return a column at rest, 1 m wide, with a number of cells over the width; grain: grain size, m.
+
+    renewal: whether long particle domains are replaced by new ones.
+    """
     h, reach = 1 / cells, np.ceil(1.4 * published(aspect) + 2.5)
     grid = mpm.Grid([0, 0], [reach, aspect + 2 * h], [round(reach * cells), round(aspect * cells) + 2])
     weight = DENSITY * GRAVITY * aspect
@@ -76,7 +79,7 @@ def column(aspect: float, cells: int, grain: float = GRAIN) -> mpm.Simulation:
     gate = mpm.Displacement("right", (0, 0), "x")
     viscosity = RISE * grain * np.sqrt(DENSITY / 0.6 * weight / 4)
     options = {"walls": {"left": "x", "bottom": "xy"}, "gravity": (0, -GRAVITY), "inertia": False}
-    options |= {"terms": [common.viscous(viscosity)] if grain else []}
+    options |= {"terms": [common.viscous(viscosity)] if grain else [], "numerics": mpm.Numerics(renewal=renewal)}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, aspect])], [sand], conditions=[gate], **options)
     s.run(1.0, 1.0, progress=False)
     s.stage(inertia=True, conditions=[])
@@ -92,9 +95,12 @@ def depths(s: mpm.Simulation, h: float) -> tuple[np.ndarray, np.ndarray]:
     return (edges[1:] + edges[:-1]) / 2, (s.points.volume0 * s.points.J) @ np.diff(share, axis=1) / h
 
 
-def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN) -> Heap:
-    """Release a column and return its `Heap`.  steps: number of steps in the time sqrt(H/g); grain: see `column`."""
-    s = column(aspect, cells, grain)
+def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN, renewal: bool = False) -> Heap:
+    """Release a column and return its `Heap`.
+
+    steps: number of steps in the time sqrt(H/g); grain, renewal: see `column`.
+    """
+    s = column(aspect, cells, grain, renewal)
     fall = np.sqrt(aspect / GRAVITY)
     before, profiles = s.points.corners.copy(), []
 
@@ -108,6 +114,8 @@ def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN) -> 
     front = x[k] + (depth[k] - GRAIN) / (depth[k] - depth[k + 1]) * (x[k + 1] - x[k])
     e = result.energies
     total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["viscous"] - e["external"]
+    if renewal:
+        total = total + e["renewal"]
     work = e["external"][-1]
     shares = np.abs(total - total[0]).max() / work, e["kinetic"][-1] / work
     return Heap(front - 1, depth.max(), *shares, before, s.points.corners, profiles, result)
@@ -120,6 +128,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--finer", type=float, default=1.0, help="factor for the number of cells over the width")
     parser.add_argument("--steps", type=float, default=STEPS, help="steps in sqrt(H/g)")
     parser.add_argument("--grain", type=float, default=GRAIN, help="grain size divided by the width; 0: no viscosity")
+    parser.add_argument("--renewal", action="store_true", help="replace particle domains that are longer than a cell")
     o = parser.parse_args(argv)
     if not all(0.25 <= a <= 16 for a in o.aspects):
         parser.error(f"--aspects {o.aspects}: must be in [0.25, 16]")
@@ -131,7 +140,7 @@ def main(argv: list[str] | None = None) -> dict:
         rows, heaps = [], {}
         for a in o.aspects:
             cells = max(2, round(o.finer * CELLS[min(CELLS, key=lambda k: abs(np.log(k / a)))]))
-            heaps[a] = one = collapsed(a, cells, o.steps, o.grain)
+            heaps[a] = one = collapsed(a, cells, o.steps, o.grain, o.renewal)
             off = one.run_out / published(a) - 1
             out[f"{a:g}"] = {"run_out": one.run_out, "off": off, "height": one.height, "lost": one.lost, "cells": cells}
             rows.append(
@@ -139,7 +148,7 @@ def main(argv: list[str] | None = None) -> dict:
             )
         common.table([["a", "cells", "run-out / L", "Lube et al.", "off", "energy lost"], *rows])
         within = all(abs(of["off"]) <= SCATTER and of["lost"] <= BALANCE for of in out.values())
-        usual = (o.aspects, o.finer, o.steps, o.grain) == (list(CELLS), 1.0, STEPS, GRAIN)
+        usual = (o.aspects, o.finer, o.steps, o.grain, o.renewal) == (list(CELLS), 1.0, STEPS, GRAIN, False)
         out["converged"] = within or not usual
         draw(o, heaps)
     return out

@@ -8,10 +8,11 @@ known, because the semi-discrete equations have an exact solution in time.  The 
 number of steps.  If pressures were averaged to points and back in every step, they would diffuse.  Three columns are
 computed:
 
-* column at rest on the grid; * moving column: during consolidation the base moves down by half the height, through half
-of all cells; * moving column with soft water: the fluid stores as much as the skeleton, S = 1/M (storage coefficient S,
-oedometric modulus M).  The pressure of stiff water follows
-  from the strain of the points, but that of soft water is also remapped from grid to grid.
+* column at rest on the grid;
+* moving column: during consolidation the base moves down by half the height, through half of all cells;
+* moving column with soft water: the fluid stores as much as the skeleton, S = 1/M (storage coefficient S, oedometric
+  modulus M).  The pressure of stiff water follows from the strain of the points.  The pressure of soft water is also
+  remapped from grid to grid.
 
 Motion adds an error, because all points of a cell have the same strain increment in a step.  This error is largest at
 the drained top, in cells that contain little of the column.  The error of the remap itself is of second order and

@@ -4,6 +4,7 @@
 import tracemalloc
 from dataclasses import replace
 
+import meshio
 import numpy as np
 import pytest
 
@@ -74,3 +75,19 @@ def test_the_last_digit_of_coordinates_does_not_decide_how_many_rows_a_box_has()
             lower = np.array([0.7 + cells, 0.0 + cells]) * h
             found.append(len(mpm.box(grid, lower, lower + np.array([5.5, 1.0]) * h, per_cell=per_cell)))
         assert found == [rows * per_cell] * 4, found
+
+
+@pytest.mark.parametrize("kind", ["box", "triangles", "quadrilaterals"])
+def test_domains_share_the_digits_of_their_corners_far_from_the_origin(kind):
+    """Gaps of a last digit interrupt lines of flow through layers: a flow differed by 1e-6, a million cells away."""
+    grid = mpm.Grid(lower=[4.1e5, -9.3e5], upper=[4.1e5 + 2.1, -9.3e5 + 1.3], cells=[6, 4])
+    if kind == "box":
+        body = mpm.box(grid, grid.lower + 0.17, grid.upper - 0.13, per_cell=3)
+    else:
+        x = grid.lower + np.array([[0.1, 0.1], [1.9, 0.2], [1.7, 1.1], [0.3, 1.0], [1.07, 0.59]])
+        cells = {"triangles": ("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])}
+        cells["quadrilaterals"] = ("quad", [[0, 1, 2, 3]])
+        body = mpm.from_mesh(grid, meshio.Mesh(x, [cells[kind]]), per_cell=3)
+    node, x = body.nodes(np.arange(len(body))).ravel(), body.corners().reshape(-1, 2)
+    first, at = np.unique(node, return_index=True, return_inverse=True)[1:]
+    assert (x == x[first][at]).all() and len(first) < len(node) / 2

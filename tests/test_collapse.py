@@ -6,8 +6,10 @@ from collapse import CELLS, SCATTER, STEPS, collapsed, published
 
 
 @pytest.mark.slow
-def test_a_column_of_sand_runs_out_as_far_as_lube_s():
+@pytest.mark.parametrize("renewal", [False, True])
+def test_a_column_of_sand_runs_out_as_far_as_lube_s(renewal):
     """As high as wide: it comes to rest, and energies balance to 2 % of the work of its weight."""
-    one = collapsed(1.0, CELLS[1.0], STEPS)
+    one = collapsed(1.0, CELLS[1.0], STEPS, renewal=renewal)
+    assert (one.result.renewals > 20) is renewal
     assert one.run_out == pytest.approx(published(1.0), rel=SCATTER)
     assert one.lost < 0.02 and one.left < 1e-3

@@ -13,10 +13,11 @@ from mpm_dolfinx.points.cutting import corner_bits, domain_volumes
 WEIGHT, STRONG = 20e3, 5e3  # N/m3, Pa
 
 
-def collapsed(cells, weak, steps, renewal=False, stages=8, strong=STRONG, wide=6, base="xy"):
+def collapsed(cells, weak, steps, renewal=False, stages=8, strong=STRONG, wide=6, base="xy", stage=8.0):
     """Return the fullest cell's filled fraction, volume of domains over that of points, and front, m, of running clay.
 
-    A column, 1 m wide and high, loses its strength in stages.  base: components that the wall below it fixes.
+    A column, 1 m wide and high, loses its strength in stages of `stage` s, with so many steps in each.  base:
+    components that the wall below it fixes.
     """
     grid = mpm.Grid([0, 0], [wide, 1 + 1 / cells], [wide * cells, cells + 1])
     moduli = {"bulk": 1500 * WEIGHT, "shear": 30 * WEIGHT, "friction": 0.0, "dilation": 0.0}
@@ -36,7 +37,7 @@ def collapsed(cells, weak, steps, renewal=False, stages=8, strong=STRONG, wide=6
 
     for cohesion in np.geomspace(strong, weak, stages + 1)[1:]:
         s.stage(fields={"cohesion": cohesion})
-        s.run(s.t + 8.0, 8.0 / steps, observe=[look], progress=False)
+        s.run(s.t + stage, stage / steps, observe=[look], progress=False)
     return np.transpose(seen)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.bodies.touching import Faces, covers
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
@@ -158,3 +159,22 @@ def test_finite_elements_take_the_same_unit_weight():
         fem.run(10 * unit.time, 10 * unit.time, probes=[size / 2])
         pressures.append(fem.pressure(np.array([[0.0, 0.0]]))[0] / unit.stress)
     assert pressures[1] == pytest.approx(pressures[0], rel=1e-6)
+
+
+def test_sides_of_bent_bodies_cover_each_other_alike_in_any_unit_of_length():
+    """In plane strain the unit width of faces was one of their edges: with longer cells, gaps counted as contact."""
+
+    def contacts(length):
+        grid = mpm.Grid([0, -length], [5 * length, 4 * length], [5, 5])
+
+        def bent(x):
+            return np.stack([x[:, 0], x[:, 1] + 1e-4 * np.sin(x[:, 0] / length) * (2 * length - x[:, 1])], axis=1)
+
+        lower, upper = mpm.box(grid, [0, 0], [4 * length, 2 * length]), mpm.box(grid, [0, 2 * length], [3 * length] * 2)
+        return covers(Faces.around(mpm.mapped(grid, lower, bent)), Faces.around(mpm.mapped(grid, upper, bent)))
+
+    metres = contacts(1.0)
+    assert len(metres.face) and metres.slack.max() > 1e-6
+    for length in (1e-3, 1e3):
+        other = contacts(length)
+        assert (other.face == metres.face).all() and other.slack == pytest.approx(metres.slack, rel=1e-4)

@@ -390,7 +390,7 @@ def rained(k: float, steep: float) -> Scene:
 def evaporation():
     """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: exact heads.
 
-    The head of the air is -1.5 m.
+    The surface dries to a pressure head of -1.5 m at most.
     """
     for k in decades(-12, 0, 4):
         for steep in decades(-3, 2):
@@ -398,7 +398,7 @@ def evaporation():
 
 
 def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
-    """Return the column, in which water is initially at rest, and dries at its top; driest: head of the air, m.
+    """Return the column with water at rest that dries at its top; driest: least pressure head there, m.
 
     The potential evaporation is larger than the flow from the water table.
     """

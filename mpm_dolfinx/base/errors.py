@@ -57,6 +57,10 @@ class NotConverged(StepFailed):
         self.history = history
 
 
+class CannotFollow(NotConverged):
+    """A time step in which bodies cannot follow a prescribed displacement, however short the step."""
+
+
 class LeftGrid(StepFailed):
     """A material point that is outside the grid after a converged step.
 

@@ -44,9 +44,20 @@ class LatticeBody(Body):
             numbers = np.arange(len(self))[chosen] if chosen.dtype == bool else chosen
         return np.stack(np.unravel_index(numbers, self.count), axis=-1)
 
+    def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
+        return self.origin + index * self.spacing
+
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
-        return self.origin + self._index(chosen) * self.spacing
+        return self._at(self._index(chosen))
+
+    def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map.
+
+        Domains have the same digits at a shared corner: far from the origin no gap opens between them.
+        """
+        return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
@@ -80,8 +91,8 @@ class LatticeBody(Body):
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
-        low, high = (self.origin + index * self.spacing for index in self._ends)
-        return low, high + self.spacing
+        low, high = self._ends
+        return self._at(low), self._at(high + 1)
 
     @property
     def lattice(self) -> tuple[int, ...]:
@@ -105,10 +116,6 @@ class RowsBody(LatticeBody):
         """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
-    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
-        return self._at(self._index(chosen))
-
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edge lengths (m, d), m, of the boxes of the chosen domains, before the map."""
         index = self._index(chosen)
@@ -118,20 +125,10 @@ class RowsBody(LatticeBody):
         """Return the reference positions (m, d), m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
-    def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
-        return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
-
     def across(self, axis: int) -> tuple[float, float]:
         """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
-
-    @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
-        low, high = self._ends
-        return self._at(low), self._at(high + 1)
 
     @property
     def volume_of_boxes(self) -> float:

@@ -121,7 +121,7 @@ class MeshBody(Body):
         """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
         return self.vertices[chosen]
 
-    def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def nodes(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
         """Return node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
         return self._nodes[rows]
 
@@ -162,6 +162,8 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
     named = {side: rows for side, rows in zip(tagged, tagged_rows, strict=True) if rows.any()}
     body = MeshBody(vertices=vertices, surface=surface, tagged=named, material=material)
+    node = body.nodes(slice(None))  # domains have the same digits at a shared node, as those of boxes
+    vertices[...] = vertices.reshape(-1, grid.dim)[np.unique(node, return_index=True)[1]][node]
     _check_conforming(body, name)
     return check_inside(grid, body, name)
 

@@ -51,11 +51,10 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (m, 2), m, of the shorter of two opposite edges of each face, for both face axes."""
+        """Return the length (m,), m, of the shortest edge of each face; the unit width of plane strain is no edge."""
         c = self.corners
-        along = [np.linalg.norm([c[:, 1] - c[:, 0], c[:, 3] - c[:, 2]], axis=2)]
-        along += [np.linalg.norm([c[:, 2] - c[:, 0], c[:, 3] - c[:, 1]], axis=2)]
-        return np.stack([a.min(axis=0) for a in along], axis=1)
+        pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
+        return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
 
 
 @dataclass
@@ -128,7 +127,7 @@ def covers(own: Faces, other: Faces) -> Cover:
     low, high = t.min(axis=1), t.max(axis=1)
     edge, bend = own.edge()[i], own.bend[i] + other.bend[j]
     tolerance = 4 * rounding(own.corners)
-    slack = np.minimum(SAME + (tolerance + bend) / np.maximum(edge.min(axis=1), TINY), (high - low).min(axis=1) / 4)
+    slack = np.minimum(SAME + (tolerance + bend) / np.maximum(edge, TINY), (high - low).min(axis=1) / 4)
     upper = t > ((low + high) / 2)[:, None]
     corner = upper @ [1, 2]
     straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, SAME)
@@ -150,7 +149,7 @@ def covers(own: Faces, other: Faces) -> Cover:
         for bits in BITS:
             at = out.at(np.where(bits, ends[1], ends[0]))
             gap = np.where(straight, np.maximum(gap, np.abs((at * off).sum(axis=1))), gap)
-    on &= gap <= NEAR * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + tolerance + 2 * bend
+    on &= gap <= NEAR * np.minimum(edge, other.edge()[j]) + tolerance + 2 * bend
     return Cover(*(getattr(out, name)[on] for name in Cover.__dataclass_fields__))
 
 

@@ -107,6 +107,7 @@ class Place(NamedTuple):
     t: float  # end of the substep, s
     before: Outcome  # reactions, outflows and other results of the previous step
     inertia: bool = False  # whether the bodies have inertia
+    begins: bool = False  # whether the step is the first of its stage
 
 
 class Shares(NamedTuple):
@@ -161,9 +162,9 @@ class Loads:
         """With inertia, return the data of this converged substep that the next substep needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers at u on this process, W: dissipation by slip, and a power to add to that of `push`.
+        """Return two powers at u on this process, W: the dissipation by slip, and a correction of the external power.
 
-        `v` are nodal velocities, a local array, m/s.
+        Without it, the external power is that of the forces in `push` at the nodal velocities v, a local array, m/s.
         """
         return 0.0, 0.0
 

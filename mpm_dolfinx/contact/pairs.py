@@ -157,7 +157,7 @@ def at_nodes(
     value: NDArray[np.float64],
     other: NDArray[np.int64] | None = None,
 ) -> PETSc.Mat:
-    """Return the matrix with values (m, 2^d) in the columns of the nodes of cells, for each component.
+    """Return the matrix with d rows for each pair: its values (m, 2^d), in the columns of a component at its cell.
 
     `other` are lexicographic cells of any process.  With `other`, values (m, 2 * 2^d) include the nodes of these cells.
     """

@@ -113,7 +113,7 @@ class Tool:
     Raises
     ------
     ValueError
-        An invalid value.  From a step: the tool starts inside a body, or touches a side with prescribed displacement.
+        An invalid value.  A step raises it if the tool starts in a body or touches a side with prescribed displacement.
     """
 
     shape: Shape | Callable[[NDArray[np.float64]], ArrayLike]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tensors at positions in the bodies, fitted to the values of the surrounding points (`LocalFit`)."""
+"""Tensors at positions in the bodies, fitted to the values of the surrounding points (`local_fit`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import centroids, edges
-from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
+from mpm_dolfinx.points.local_fit import RADIUS, fitted, near
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 
 
@@ -57,9 +57,8 @@ def fitted_at(
     values = tensor(points.map(lambda rows: rows[used]))[place]
     shape = values.shape[1:]
     values = values.reshape(len(row), int(np.prod(shape)))
-    fit = LocalFit(m, d, 1, int(np.prod(shape)))
-    fit.add(probe, np.einsum("rij,rj->ri", now[probe], points.x[row] - x[probe]), values, weight)
-    return fit.values(comm).reshape(m, *shape)
+    offset = np.einsum("rij,rj->ri", now[probe], points.x[row] - x[probe])
+    return fitted(comm, m, 1, probe, offset, values, weight).reshape(m, *shape)
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:

@@ -11,8 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
-from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, ranges, sum_by
-from mpm_dolfinx.points.cutting import cut, on_planes, simplex_volumes, sliced, slices_in_cells, vertices, volumes
+from mpm_dolfinx.grid.grid import FACES, TURN, Grid, corner_bits, ranges, sum_by
+from mpm_dolfinx.points.cutting import (
+    cut,
+    domain_volumes,
+    on_planes,
+    simplex_volumes,
+    sliced,
+    slices_in_cells,
+    vertices,
+    volumes,
+)
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
@@ -53,7 +62,7 @@ class OuterFaces:
     point: NDArray[np.int64]  # material point (n,)
     face: NDArray[np.int64]  # index of the face in its domain (n,)
     key: NDArray[np.int64]  # key of the seeded face (n,), see `renewed_faces`
-    area: NDArray[np.float64]  # seeded length (n,), m
+    area: NDArray[np.float64]  # seeded area (n,), m^(d-1), in axisymmetry of the ring
     ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (n, 2, 2), m
 
 
@@ -63,8 +72,13 @@ class New(NamedTuple):
     corners: NDArray[np.float64]  # (n, 4, 2), m
     group: NDArray[np.int64]  # index of the group (n,); its domains receive values from the same pieces
     parent: NDArray[np.int64]  # key of the seeded face for each face, or -1 (n, 4)
-    area: NDArray[np.float64]  # seeded length of each face (n, 4), m
+    area: NDArray[np.float64]  # seeded area of each face (n, 4), m^(d-1), in axisymmetry of the ring
     ends: NDArray[np.float64]  # reference positions of the ends of each face (n, 4, 2, 2), m
+
+
+def ring_lengths(grid: Grid, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
+    """Return the factor from lengths in the plane to areas at x (n, 2), m, see `Grid.around`; not zero at the axis."""
+    return np.maximum(grid.around(x), TURN * EPSILON * grid.least) if grid.axisymmetric else 1.0
 
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
@@ -80,7 +94,8 @@ class RefilledCells:
     """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
     body (n,): index of each point's body; flowed (n,): whether points may be renewed; needs (n,): whether their domains
-    need renewal; faces: surface of the bodies; signs: the conditions on these faces, see `Renewal._signatures`.
+    need renewal; faces: surface of the bodies; signs: the conditions on these faces, see `Renewal._signatures`; second:
+    whether to compute second moments of the pieces.
     """
 
     def __init__(
@@ -92,18 +107,19 @@ class RefilledCells:
         needs: NDArray[np.bool_],
         faces: OuterFaces,
         signs: tuple[NDArray, NDArray],
+        second: bool = False,
     ):
         self.grid = grid
         self.points = points
         self.body = body
-        self.pieces = cut(grid, points.corners)
+        self.pieces = cut(grid, points.corners, second)
         self.cell = self.pieces.cell
         self.cells = grid.cells
         self.faces = faces
         self.parts = self._parts(faces)
         excluded = self._excluded(flowed, signs)
         self.crossed, self.region = self._chains(excluded)
-        size = self.pieces.fraction * np.abs(volumes(points.corners))[self.pieces.point] / self._volume(self.cell)
+        size = self._areas / self._volume(self.cell)
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
         self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
@@ -114,6 +130,16 @@ class RefilledCells:
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
         """Return the areas (n,), m^2, of cells (n,); one number for equal cells."""
         return self.grid.sizes_of(cells).prod(axis=-1)
+
+    @cached_property
+    def _areas(self) -> NDArray[np.float64]:
+        """Areas (m,), m^2, of the pieces of domains, in axisymmetry of their sections."""
+        pieces = self.pieces
+        whole = np.abs(volumes(self.points.corners))
+        if not self.grid.axisymmetric:
+            return pieces.fraction * whole[pieces.point]
+        area = pieces.fraction / pieces.hoop[:, 3]
+        return area * (whole / sum_by(pieces.point, area, len(whole)))[pieces.point]
 
     def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which points (n,) have a piece in any of the cells."""
@@ -211,7 +237,9 @@ class RefilledCells:
         kept = once[cell]
         cell, x = cell[kept], x[kept]
         at = np.flatnonzero(once)
-        surface = resampled(np.searchsorted(at, cell), x, P[at], Q[at])
+        ends = self._place(at, np.tile(BOX[:, :2], (len(at), 1, 1)))
+        around = np.broadcast_to(self.grid.around(ends.reshape(-1, 2)), 2 * len(at)).reshape(-1, 2)
+        surface = resampled(np.searchsorted(at, cell), x, P[at], Q[at], around)
         region = Region(at, surface)
         excluded[at[~region.simple]] = True
         return crossed, region
@@ -242,7 +270,7 @@ class RefilledCells:
         inner = np.flatnonzero(self.parts.side == NONE)
         parts = Parts(*(column[inner] for column in self.parts))
         order = np.argsort(parts.cell, kind="stable")
-        whole = sum_by(parts.cell, self.faces.area[parts.row] * np.ptp(parts.t, axis=1), self.cells)
+        whole = sum_by(parts.cell, self._seeded(parts.row, parts.t), self.cells)
         rows, local, surface = self.region.quadrilaterals(self.chosen)
         cells = self.region.cells[rows]
         parent, area, ends = _no_faces(len(cells))
@@ -250,8 +278,9 @@ class RefilledCells:
         lower, upper = (local[at, FACES[2][face, k]] for k in (0, 1))
         key, X = self._nearest(parts, order, cells[at], lower, upper)
         parent[at, face], ends[at, face] = key, X
-        edge = np.linalg.norm(upper - lower, axis=1)
-        total = sum_by(cells[at], edge, self.cells)  # length of all new edges on the surface
+        middle = self._place(cells[at], ((lower + upper) / 2)[:, None])[:, 0]
+        edge = np.linalg.norm(upper - lower, axis=1) * ring_lengths(self.grid, middle)
+        total = sum_by(cells[at], edge, self.cells)  # of all new edges on the surface
         area[at, face] = edge / total[cells[at]] * whole[cells[at]]
         return self._partial(cells, local, parent, area, ends)
 
@@ -285,6 +314,15 @@ class RefilledCells:
         key = self.faces.key[found[0][0]]
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
+    def _seeded(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the seeded areas (n,), m^(d-1), of parts of faces, from and to coordinates t (n, 2) on the faces."""
+        share = np.ptp(t, axis=1)
+        if self.grid.axisymmetric:
+            corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
+            r0, r1 = (corners[np.arange(len(row)), end[face], 0] for end in (START, END))
+            share = share * _ring_share(r0, r1, t.mean(axis=1))
+        return self.faces.area[row] * share
+
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, 2), m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
         face = self.faces.face[row]
@@ -308,7 +346,8 @@ class RefilledCells:
         order = np.argsort(place, kind="stable")
         bordered = Parts(parts.row[on], place, parts.x[on], parts.t[on], parts.side[on])
         length = np.linalg.norm(bordered.x[:, 1] - bordered.x[:, 0], axis=1)
-        seeded = self.faces.area[bordered.row] * np.ptp(bordered.t, axis=1)
+        length = length * ring_lengths(self.grid, self._place(parts.cell[on], bordered.x.mean(axis=1)[:, None])[:, 0])
+        seeded = self._seeded(bordered.row, bordered.t)
         count = 4 * self.cells
         dense = sum_by(place, seeded, count) / np.maximum(sum_by(place, length, count), TINY)
         known = np.unique(place)
@@ -331,7 +370,8 @@ class RefilledCells:
                 at, sides = at[covered], sides[covered]
                 key, X = key[covered], X[covered]
                 parent[at, face], ends[at, face] = key, X
-                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[sides]
+                around = ring_lengths(self.grid, self._place(cells[at], ((a + b)[at] / 2)[:, None])[:, 0])
+                area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * around * dense[sides]
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
 
     @property
@@ -349,8 +389,7 @@ class RefilledCells:
         """The results of `remainders` and `outside`.  New domains from the same piece form a group, see `New`."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
-        area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
-        left = left[area > CRUMB * self._volume(self.cell[left])]
+        left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
@@ -381,7 +420,10 @@ class RefilledCells:
                 for c in FACES[2][face]
             ]
             parent[at, face] = faces.key[row]
-            area[at, face] = faces.area[row] * np.abs(t[1] - t[0])
+            part = np.abs(t[1] - t[0])
+            if self.grid.axisymmetric:
+                part = part * _ring_share(low[:, 0], high[:, 0], (t[0] + t[1]) / 2)
+            area[at, face] = faces.area[row] * part
             X0, X1 = faces.ends[row].transpose(1, 0, 2)
             ends[at, face] = np.stack([X0 + s[:, None] * (X1 - X0) for s in t], axis=1)
         return New(corners, int(self.chosen.sum()) + number.ravel(), parent, area, ends), left
@@ -430,8 +472,11 @@ class RefilledCells:
         old = self.pieces.point[piece[of]]
         common = np.zeros(len(of))
         rings, which = _convex(self.points.corners[old], self._volume(self.cell[piece[of]]))
-        common += np.maximum(sum_by(which, rings.within(corners[at][which][:, RING]).area, len(of)), 0.0)
-        common += EPSILON * np.abs(volumes(corners[at]))  # a domain without overlap receives the mean of its cell
+        both = rings.within(corners[at][which][:, RING])
+        around = self.grid.around(both.centroid) if self.grid.axisymmetric else 1.0
+        common += np.maximum(sum_by(which, both.area * around, len(of)), 0.0)
+        whole = np.abs(domain_volumes(corners[at], self.grid.axisymmetric))
+        common += EPSILON * whole  # a domain without overlap receives the mean of its cell
         total = sum_by(of, common, len(piece))
         return old, at, share[of] * common / total[of]
 
@@ -448,6 +493,7 @@ class RefilledCells:
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
         length = np.linalg.norm((parts.x[inside, 1] - parts.x[inside, 0]) * self.grid.sizes_of(cell), axis=1)
+        length = length * ring_lengths(self.grid, self._place(cell, parts.x[inside].mean(axis=1)[:, None])[:, 0])
         flat = values[of].reshape(len(of), int(np.prod(values.shape[1:])))
         count = int(self.chosen.sum())
         number = self._group(cell)
@@ -461,6 +507,12 @@ class RefilledCells:
 def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return keys, lengths and ends of faces for n domains without faces on the surface."""
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
+
+
+def _ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return radii (n,) at coordinates t (n,) on faces from radius r0 to r1 (n,), m, relative to the mean radius."""
+    mean = (r0 + r1) / 2
+    return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:

@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of point data for each face: key of the seeded face, or -1; seeded length, m; reference ends, m."""
+"""Names of point data for each face: key of the seeded face, or -1; seeded area, m^(d-1); reference ends, m."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -41,7 +41,7 @@ class RenewedFaces:
     at: NDArray[np.int64]  # index of the point (m,)
     face: NDArray[np.int64]  # index of the face in its domain (m,)
     xi: NDArray[np.float64]  # local coordinates of the ends of the face's part in the surface (m, 2, 2)
-    area: NDArray[np.float64]  # seeded length (m,), m, see `AREA`
+    area: NDArray[np.float64]  # seeded area (m,), m^(d-1), in axisymmetry of the ring, m^2, see `AREA`
     ends: NDArray[np.float64]  # reference positions of the ends (m, 2, 2), m, see `ENDS`
     old: NDArray[np.bool_] | None = None  # if rows are positions: whether each lies on a seeded face (n,)
 
@@ -59,7 +59,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of parts and whole faces, m, and face indices (n,), with new values at renewed faces."""
+        """Return areas of parts and whole faces, and face indices (n,), with new values at renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))

@@ -30,13 +30,13 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 
 
 def initial_energies(
-    materials: SceneMaterials, points: MaterialPoints, kinetic: float
+    materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, from which `after` counts, see `Result.energies`; `internal` is the work of the stresses.
 
-    kinetic: kinetic energy of free tools, J.
+    kinetic: kinetic energy of free tools, J; renews: whether domains may be renewed.
     """
-    works = dict.fromkeys(("internal", "viscous", "friction", "external"), 0.0)
+    works = dict.fromkeys(("internal", "viscous", "friction", "external", *["renewal"] * renews), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)
 
 
@@ -58,7 +58,20 @@ def after(
     works = {name: float(before[name]) + more for name, more in work}
     now = stored(materials, points)
     start = before["elastic"] + before["dissipated"] - before["internal"]
+    works |= {name: float(before[name]) for name in ("renewal",) if name in before}
     return _named(now, works, start + works["internal"] - now["elastic"], kinetic)
+
+
+def after_renewal(
+    materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
+) -> Mapping[str, NDArray[np.float64]]:
+    """Return the energies, J, after renewal of particle domains, from those before; `renewal` is the loss."""
+    if not renewed:
+        return energy
+    now = stored(materials, new)
+    change = {name: now[name] - value for name, value in stored(materials, old).items()}
+    change["renewal"] = -sum(change.values())
+    return {**energy, **{name: energy.get(name, 0.0) + value for name, value in change.items()}}
 
 
 def _named(

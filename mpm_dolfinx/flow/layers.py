@@ -129,7 +129,7 @@ class MixedCells:
         share: NDArray[np.float64] | None,
         now: NDArray[np.float64] | None = None,
     ) -> Mobility:
-        """Return the mobility of filled cells, from means (n,) and mobilities `kappa` of all pieces, m^2/(Pa s).
+        """Return the mobility of filled cells.  kappa: mobilities of pieces; mean (n,): their cell means, m^2/(Pa s).
 
         `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  `now`
         are the mobilities of all pieces at their pressures, in unsaturated soil.  If `now` is given, only inclined

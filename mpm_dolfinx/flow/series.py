@@ -30,8 +30,8 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
 
-    Lines that cross a single soil conduct in parallel, one entry for each of l retention curves; entry 0 is saturated
-    soil.  The other lines are replaced by one line with s soils in series.
+    Lines that cross a single soil conduct in parallel.  `parallel` has one entry for each of l retention curves; the
+    first is for soil without a curve.  The other lines are replaced by one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)

@@ -197,7 +197,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             leaves = dict.fromkeys(LEAVE) if stay is not None and stay.keeps is None else {}
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
-                raise ValueError("pieces: of_cell, start: do not fit the kept cut")
+                raise ValueError("pieces/of_cell, pieces/start: must both be given with stay/, and only then")
         of_trend = _part(arrays, "trend/")
         trend = Trend(**of_trend) if of_trend else None
         if trend is not None:

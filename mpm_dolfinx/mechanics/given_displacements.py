@@ -19,7 +19,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.errors import CannotFollow
 from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
@@ -220,18 +220,22 @@ class GivenDisplacements(Acting):
             self._warned.add((number, what))
 
     def check_came(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise NotConverged if all points of a side follow less than half of their prescribed increment."""
+        """Raise CannotFollow if all points of a side follow less than half of their prescribed increment."""
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
-            old, new, way = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            moves = way > NEAR * self._grid.least
-            came = 1 - ((new - old)[moves] / way[moves]).min(initial=np.inf)
-            came = over_all(self._grid.comm, float(came), MPI.MAX)
-            if -np.inf < came < 0.5:  # less than half of the increment
-                what = f"{line(hold)}: the bodies follow at most {max(0.0, came):.0%} of the prescribed increment"
-                raise NotConverged(f"{what}, must be free to move: undrained pores keep their water")
+            old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
+            if place.begins:  # a value that does not begin at the present position, by more than penalties give way
+                jump = np.linalg.norm((p.origin(before) + end - p.now(before))[:, axes], axis=1)
+                sudden = HOLD * jump > self._grid.least
+                old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)
+            moves = increment > NEAR * self._grid.least
+            share = 1 - ((new - old)[moves] / increment[moves]).min(initial=np.inf)
+            share = over_all(self._grid.comm, float(share), MPI.MAX)
+            if -np.inf < share < 0.5:  # less than half of the increment
+                what = f"{line(hold)}: the bodies follow at most {max(0.0, share):.0%} of the prescribed increment"
+                raise CannotFollow(f"{what}, must be free to move: undrained pores keep their water")
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
@@ -296,22 +300,24 @@ class HoldLoads(Loads):
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
         self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
-        self._lacked = np.full(len(acting.held) * self._d, np.inf)
+        self._lacked = np.full(1, np.inf)  # for sides of each part: what `augment` has found, infinite at first
 
     def augment(self, at: At) -> bool:
         """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
 
         A body such as one of sealed water resists the side's motion more stiffly than a single cell would.  The updates
-        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.
+        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.  Means are
+        over the faces of each connected part of the bodies.
         """
         if not self._place.dt:
             return False
         means, axis = self.row < self.held.limit.shape[1], self.data["direction"].argmax(axis=1)
-        side = self._d * self.held.number[self.row] + axis
+        side = (self._d * self.held.number[self.row] + axis) * at.parts.count + at.parts.cells[self.data.cells]
+        count = len(self._acting.held) * self._d * at.parts.count
         weight = np.where(means, self.data["stiffness"][:, 0], 0.0)
         gap = np.where(means, self._asked - self._along(at.nodal), 0.0)
         ways = gap, np.abs(self.held.way[self.row, axis])
-        sums = np.stack([sum_by(side, weight * way, len(self._lacked)) for way in ways])
+        sums = np.stack([sum_by(side, weight * way, count) for way in ways])
         lacks, goes = np.abs(over_all(self.data.points.grid.comm, sums))
         least = np.where(np.isinf(self._lacked), 1 / HOLD, NEAR)
         more = (least * goes < lacks) & (lacks < self._lacked / 2) & (goes > 0)
@@ -391,7 +397,7 @@ class HoldLoads(Loads):
         return of_cells + 4 * EPSILON * grid.reach * held
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise NotConverged if the bodies did not follow the sides."""
+        """Raise CannotFollow if the bodies did not follow the sides."""
         self._acting.check_came(self._place, points, before)
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:

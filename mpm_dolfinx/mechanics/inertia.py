@@ -350,8 +350,8 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    mass: mass of the bodies on the grid; flight, m: inertial predictor, the displacement without forces; rate, 1/s^2: 1
-    / g^2, with the weight g, s, of the substep's own rate.
+    mass: mass of the bodies on the grid; flight, m: inertial predictor, the displacement without forces; rate, 1/s^2:
+    acceleration, divided by (displacement - flight).
     """
 
     holding = True
@@ -405,7 +405,7 @@ class Flight(NamedTuple):
     acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the inertial predictor of the next substep, m; own, before: weights, s, of this and the last rate."""
+        """Return the predictor of the next substep, m; own, before: weights, s, of its rate and the rate before it."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

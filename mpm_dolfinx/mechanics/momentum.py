@@ -238,7 +238,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return sums (k, nodes) over the cells at each node, of k values of cells (cells, 1) or nodes (cells, 2^d)."""
+        """Return nodal sums (k, nodes) of k quantities of cells: values (cells, 2^d) at their nodes, or (cells, 1)."""
         (shared, values_at), nodes = self._rooms[0], self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
         of_nodes = np.array([of + np.zeros(at.shape) for of in values])

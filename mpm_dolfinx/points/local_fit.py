@@ -38,42 +38,27 @@ def near(offset: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(1 - (offset / RADIUS) ** 2, 0, None).prod(axis=1) ** 4
 
 
-class LocalFit:
-    """Polynomials about given positions, fitted to the data of all processes.
+def fitted(
+    comm: MPI.Intracomm,
+    count: int,
+    degree: int,
+    at: NDArray[np.int64],
+    offset: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the fitted values (count, width) at `count` positions, on every process; zero without data.
 
-    Parameters
-    ----------
-    count
-        Number of positions.
-    dim
-        Number d of coordinates.
-    degree
-        Degree of the polynomials, 1 or 2.
-    width
-        Number of values at each position.
+    Data of this process: `values` (r, width) for the positions `at` (r,), from 0, with weights (r,), at offsets (r, d),
+    in spacings of the data.  degree: of the polynomials, 1 or 2.
     """
-
-    def __init__(self, count: int, dim: int, degree: int, width: int = 1):
-        powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(dim), k)]
-        self._powers, size = powers, len(powers)
-        self._sums, self._shape = np.zeros((count, size * (size + width))), (count, size, size + width)
-
-    def add(self, at: NDArray[np.int64], offset: NDArray, values: NDArray, weight: NDArray) -> None:
-        """Add weighted values (r, width) to the fits at positions `at` (r,); offset (r, d), in spacings of the data."""
-        basis = np.stack([offset[:, list(p)].prod(axis=1) for p in self._powers], axis=1)
-        rows = np.concatenate([basis, values], axis=1)
-        outer = (weight[:, None] * basis)[:, :, None] * rows[:, None, :]
-        for k, column in enumerate(outer.reshape(len(at), self._sums.shape[1]).T):
-            self._sums[:, k] += sum_by(at, column, len(self._sums))
-
-    def values(self, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the fitted values (count, width) at the positions, on every process; zero without data."""
-        size = len(self._powers)
-        sums = over_all(comm, self._sums).reshape(self._shape)
-        A = sums[:, :, :size].copy()
-        b = sums[:, :, size:]
-        degree = np.array([len(p) for p in self._powers])
-        some = A[:, 0, 0] > 0
-        whole = np.where(some, A[:, 0, 0], 1.0)
-        A[:, np.arange(size), np.arange(size)] += whole[:, None] * np.array(UNTOLD)[degree] + (~some)[:, None]
-        return np.linalg.solve(A, b)[:, 0]
+    powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(offset.shape[1]), k)]
+    size = len(powers)
+    basis = np.stack([offset[:, list(p)].prod(axis=1) for p in powers], axis=1)
+    rows = (weight[:, None] * basis)[:, :, None] * np.concatenate([basis, values], axis=1)[:, None, :]
+    sums = over_all(comm, sum_by(at, rows.reshape(len(at), size * rows.shape[2]).T, count))
+    A, b = np.split(sums.T.reshape(count, size, rows.shape[2]), [size], axis=2)
+    some = A[:, 0, 0] > 0
+    whole = np.where(some, A[:, 0, 0], 1.0)
+    small = np.array(UNTOLD)[[len(p) for p in powers]]
+    return np.linalg.solve(A + np.eye(size) * (whole[:, None] * small + ~some[:, None])[:, None], b)[:, 0]

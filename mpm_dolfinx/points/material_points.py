@@ -56,7 +56,7 @@ def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3) from its in-plane part (n, 2, 2), scaled to det F, and the out-of-plane stretch (n,)."""
+    """Return F (n, 3, 3) with the out-of-plane stretch (n,); the given plane part (n, 2, 2) has its determinant."""
     out = np.zeros((len(F), 3, 3))
     out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
     out[:, 2, 2] = across

@@ -119,7 +119,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the connected part (n,), from 0, of domains with corners (n, 2^d, d), m, in copies of the grid (n,)."""
+    """Return the index (n,), from 0, of each domain's connected part; copy (n,): first cell of its copy of the grid."""
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
     own, count = _touching(

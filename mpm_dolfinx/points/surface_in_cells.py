@@ -96,13 +96,19 @@ class Region:
 
 
 def resampled(
-    of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64]
+    of: NDArray[np.int64],
+    x: NDArray[np.float64],
+    P: NDArray[np.float64],
+    Q: NDArray[np.float64],
+    around: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the surface in each cell as vertices (n, EDGES + 1, 2) from P to Q (n, 2), evenly spaced between corners.
 
-    The area between surface and chord is preserved: vertices are shifted to restore the lost area.
+    The area between surface and chord is preserved, in axisymmetry the volume of its ring: vertices are shifted to
+    restore what is lost.
 
-    of (m,), x (m, 2, 2): for each segment of the given surfaces the index of its cell, ascending, and both its ends.
+    of (m,), x (m, 2, 2): for each segment of the given surfaces the index of its cell, ascending, and both its ends;
+    around (n, 2): factor from areas to volumes, see `Grid.around`, at the lower and upper end of the first axis.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])
@@ -142,13 +148,20 @@ def resampled(
         step //= 2
     a, b = x.transpose(1, 0, 2) - P[of]
     gap = (of[1:] == of[:-1])[:, None] * (a[1:] - b[:-1])
-    bulge = sum_by(of, _cross(a, b), len(P)) + sum_by(of[1:], _cross(b[:-1], gap), len(P))
+    inner, wider = around[:, 0], around[:, 1] - around[:, 0]
+
+    def ring(a: NDArray, b: NDArray, of: NDArray) -> NDArray:
+        """Return twice the areas of triangles (P, P + a, P + b) in cells `of`, in axisymmetry of their rings."""
+        return _cross(a, b) * (inner[of] + wider[of] * (P[of, 0] + (a[:, 0] + b[:, 0]) / 3))
+
+    bulge = sum_by(of, ring(a, b, of), len(P)) + sum_by(of[1:], ring(b[:-1], b[:-1] + gap, of[1:]), len(P))
     y = out - P[:, None]
-    has = _cross(y[:, :-1], y[:, 1:]).sum(axis=1)
+    row = np.arange(len(P)).repeat(EDGES)
+    has = sum_by(row, ring(y[:, :-1].reshape(-1, 2), y[:, 1:].reshape(-1, 2), row), len(P))
     chords = out[:, 2:] - out[:, :-2]
     normal = np.stack([chords[:, :, 1], -chords[:, :, 0]], axis=2)
     size = np.maximum(np.linalg.norm(chords, axis=2), TINY)
-    shift = (bulge - has) / size.sum(axis=1)
+    shift = (bulge - has) / (size * (inner[:, None] + wider[:, None] * out[:, 1:-1, 0])).sum(axis=1)
     out[:, 1:-1] += shift[:, None, None] * normal / size[:, :, None]
     return np.clip(out, 0.0, 1.0)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`LocalFit`).
+"""Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`local_fit`).
 
 The fit uses cells that open faces connect to the probe's cell, at most three cells away along each axis.  Their soil
 must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the face
@@ -21,14 +21,14 @@ from mpm_dolfinx.domains.pressure_transport import van_leer
 from mpm_dolfinx.flow.feeding import Wet, open_sides
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
+from mpm_dolfinx.points.local_fit import RADIUS, fitted, near
 from mpm_dolfinx.probing.probes import Probes
 from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 CELLS = int(RADIUS)
-"""Number of cells along each axis from a probe's cell to the last cell with a weight in `LocalFit`."""
+"""Number of cells along each axis from a probe's cell to the last cell with a weight in `local_fit`."""
 
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
@@ -147,9 +147,10 @@ class _Around:
         start = np.zeros_like(groups)
         start[:, self._lattice.middle] = True
         reached, passes = start & self._filled, groups | start
+        pairs = [(*pair, passes[:, pair[0]] & self._opening(*side)) for side, pair in self._lattice.neighbours.items()]
         for _ in range(2 * CELLS * self._grid.dim):
-            for (axis, end), (one, other) in self._lattice.neighbours.items():
-                reached[:, other] |= (reached & passes)[:, one] & self._opening(axis, end)
+            for one, other, leads in pairs:
+                reached[:, other] |= reached[:, one] & leads
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
@@ -159,8 +160,7 @@ class _Around:
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the probes; weight (d,): unit weight of the fluid, N/m^3."""
-        comm = self._grid.comm
-        head = self._p - self._centroid @ weight
+        comm, head = self._grid.comm, self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
         rows = [(at, offset, value, share)]
@@ -168,18 +168,16 @@ class _Around:
             probe, place = np.nonzero(self._counts)
             rows += [(probe, self._centroid[probe, place], head[probe, place], np.ones(len(probe)))]
             rows += self._outside_faces(head)
-        fit = LocalFit(len(base), self._grid.dim, 2)
-        for probe, away, values, part in rows:
-            y = away / self._lattice.size[probe, self._lattice.middle]
-            cells = y
-            if not self._grid.even:
-                cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
-            fit.add(probe, y, (values - base[probe])[:, None], near(cells) * part)
+        probe, away, values, part = map(np.concatenate, zip(*rows, strict=True))
+        y = cells = away / self._lattice.size[probe, self._lattice.middle]
+        if not self._grid.even:
+            cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
+        above = fitted(comm, len(base), 2, probe, y, (values - base[probe])[:, None], near(cells) * part)[:, 0]
         least, most = (np.full(len(base), start) for start in (np.inf, -np.inf))
         np.minimum.at(least, at[own], value[own])
         np.maximum.at(most, at[own], value[own])
         low, high = np.minimum(low, over_all(comm, least, MPI.MIN)), np.maximum(high, over_all(comm, most, MPI.MAX))
-        return np.clip(base + fit.values(comm)[:, 0], low, high)
+        return np.clip(base + above, low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and upper bound (m,) of the heads, Pa, from the cell and its neighbours; see the module."""

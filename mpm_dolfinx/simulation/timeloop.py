@@ -19,7 +19,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.base.errors import LeftGrid, Report, StepFailed
+from mpm_dolfinx.base.errors import CannotFollow, LeftGrid, Report, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
@@ -277,7 +277,8 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
-        outcome["energy"] = initial_energies(scene.materials, state.points, state.stage.kinetic(outcome))
+        kinetic = state.stage.kinetic(outcome)
+        outcome["energy"] = initial_energies(scene.materials, state.points, kinetic, scene.numerics.renewal)
     return replace(state, outcome=outcome)
 
 
@@ -323,8 +324,8 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
     verbose: warn of the first reduced step of a run.
     """
     comm = simulation.scene.grid.comm
-    preferred = None
-    whole = None
+    preferred = whole = None
+    cause: StepFailed | None = None
     while True:
         state = simulation.state
         result = simulation.state.result
@@ -334,6 +335,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         try:
             new, report = simulation.advanced(size)
         except StepFailed as failed:
+            cause = cause if isinstance(cause, CannotFollow) else failed  # shorter steps may fail with less to say
             cut, counted = rule.cut(size, control), replace(result, cuts=result.cuts + 1)
             left = _has_left(failed, rule, size, state)
             if not left and cut.small >= rule.least(preferred, state.t):
@@ -344,7 +346,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
                 tried = result if left else _note(simulation, counted, replace(cut, small=size))
-                raise GaveUp(_why(state.t, size, failed), tried, failed.history) from failed
+                raise GaveUp(_why(state.t, size, cause), tried, failed.history) from failed
             size = whole
             how = (EULER,)
             (new, report) = found

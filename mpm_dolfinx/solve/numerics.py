@@ -31,7 +31,7 @@ class Numerics:
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
-        requires dry or saturated soil in plane strain, no inertia, no `Contact`, and `quadrature="domain"`.
+        requires dry or saturated soil in 2D, no inertia, no `Contact`, and `quadrature="domain"`.
     keep_volumes
         Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`; only `"domain"`.
     petsc_options

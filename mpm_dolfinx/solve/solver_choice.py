@@ -144,8 +144,8 @@ def plan(
     scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05, 179
     and 83 with 0.01, and 174 and 94 with 0.002. In 3D tangents cost more: a beam takes up to a fifth longer with 0.01.
 
-    The relative tolerance of linear solves is at least 1e-5, or 1e-3 with multigrid in 3D. With factors an iteration is
-    cheap, and a looser tolerance for the fluid costs Newton steps: a footing on 21 cells (backward Euler) takes 299
+    The relative tolerance of linear solves is at least 1e-5, or 1e-3 with multigrid in 3D. With a factorised stiffness
+    an iteration is cheap, and a looser tolerance costs Newton steps: a footing on 21 cells (backward Euler) takes 299
     Newton steps with 1e-5, and 370 with 1e-3.
 
     Parameters

@@ -185,7 +185,7 @@ def _released(
     cut = start.on_grid.cut
 
     def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return the components (nodes, d) along `axes` at nodes of cells that contain the faces `some`."""
+        """Return which components (nodes, d) lie along `axes`, at nodes of cells that contain faces of `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 

@@ -7,13 +7,14 @@ are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
-  there becomes `EDGES` edges, with the same ends, area and sharp corners.
+  there becomes `EDGES` edges, with the same ends, area and sharp corners; in axisymmetry with the same volume.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
 These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
-range of the old values. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings
-are unchanged.
+range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
+too. Cells with elastic soil, several bodies, prescribed displacements, or several surface
+crossings are unchanged.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from mpm_dolfinx.base.fluid_content import pressure_of
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
-from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen
+from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen, ring_lengths
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
+from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
 from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.cutting import centroids, volumes
+from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
 from mpm_dolfinx.stepping.state import State, Stay
 
@@ -67,7 +69,7 @@ class Renewal:
             row, face = body.outer()
             at = FACES[2][face]
             X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
-            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1) * ring_lengths(self._grid, x.mean(axis=1))
             found.append((start + row, face, keys(start + row, face), size, X))
         columns = [np.concatenate(column) for column in zip(*found, strict=True)]
         order = np.argsort(columns[2])
@@ -133,12 +135,17 @@ class Renewal:
         held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
         signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
-        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs)
+        moves = MOTION[0] in points.data
+        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders]
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, touched)
+        if moves:
+            masses = tuple(self._materials.present_density(of) * of.volume0 * of.J for of in (points, made))
+            v, L = velocities(work, made.corners, made.x, group, masses)
+            made = replace(made, data={**made.data, **dict(zip(MOTION, (v, L @ made.F), strict=True))})
         kept = ~work.affected
         replaced = points.id[work.affected]
         stay, pieces = state.stay, state.pieces
@@ -215,10 +222,9 @@ class Renewal:
         x = centroids(corners)
         off = x - np.stack([sum_by(at, weight * column, n) / total for column in points.x[old].T], axis=1)
 
-        size = np.abs(volumes(corners))
+        size = np.abs(domain_volumes(corners, self._grid.axisymmetric))
         count = int(group.max()) + 1
         M, V = (sum_by(groups, part * of[source], count) for of in (mass, mass * J))
-        A = sum_by(group, size, count)
 
         def mean(values: NDArray) -> NDArray:
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
@@ -232,9 +238,11 @@ class Renewal:
             return np.clip(means, low[group], high[group]).reshape(n, *values.shape[1:])
 
         like = np.exp(mean(np.log(J)))
-        scale = V / M * sum_by(group, size / like, count) / A  # mass and volume are both exact
-        ratio = like * scale[group]
-        volume0 = V[group] * size / A[group] / ratio
+        volume0, volume = (size / one / sum_by(group, size / one, count)[group] for one in (like, 1.0))
+        if work.pieces.second.size:
+            volume0, volume = (centred(work, group, x, *of) for of in ((volume0, mass), (volume, mass * J)))
+        volume0, volume = M[group] * volume0, V[group] * volume  # mass and volume are both exact
+        ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
             """Return means with an exact mass-weighted sum: corrections stay within the values' range."""
@@ -255,7 +263,9 @@ class Renewal:
         body[at] = work.body[old]
         moved = mean(points.x - centroids(points.origin))
         d = points.F.shape[1]
-        F = ratio[:, None, None] ** (1 / d) * np.eye(d)
+        stretch = ratio[:, None, None] ** (1 / d)
+        F = stretch * np.eye(d)
+        fixed = x * [not self._grid.axisymmetric, True]  # radii too are stretched
         data = {}
         logs = np.zeros((len(points), 3, 3))
         logs[work.affected] = _of_tensors(np.log, self._elastic(points, np.flatnonzero(work.affected)))
@@ -266,7 +276,7 @@ class Renewal:
                 data[name] = work.on_faces(values, corners, parent, group, points)
             elif name == ACROSS:
                 data[name] = across
-            elif name not in (PARENT, AREA, ENDS, "plastic"):
+            elif name not in (PARENT, AREA, ENDS, *MOTION, "plastic"):
                 data[name] = kept(values)
         data |= {PARENT: parent, AREA: area, ENDS: ends}
         used = points.id[points.id >= self._starts[-1]]
@@ -280,7 +290,7 @@ class Renewal:
             pressure=kept(points.pressure),
             x=x,
             origin=corners - moved[:, None],
-            reference=x[:, None] + (corners - x[:, None]) / ratio[:, None, None] ** 0.5,
+            reference=fixed[:, None] + (corners - fixed[:, None]) / stretch,
             data=data,
         )
 

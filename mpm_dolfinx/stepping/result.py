@@ -147,8 +147,9 @@ class Result:
         `kinetic` and `elastic` are energies of the bodies and free tools; `elastic` is 0 for laws without an energy.
         Works since the start of the run: `external`, of all loads; `viscous`, on quiet sides and of user-defined terms;
         `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
-        `elastic`, in wet bodies with the work of flow and storage of water. `kinetic` + `elastic` + `dissipated` +
-        `viscous` + `friction` - `external` is constant, up to losses of the method.
+        `elastic`, in wet bodies with the work of flow and storage of water. With `Numerics(renewal=True)`, `renewal` is
+        the kinetic and elastic energy that renewed domains have lost. `kinetic` + `elastic` + `dissipated` +
+        `viscous` + `friction` + `renewal` - `external` is constant, up to losses of the method.
         """
         return self.outcome("energy")
 

@@ -186,7 +186,7 @@ class Scene:
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        The weight is that in `stage` at the start t, s, of a step; with varying gravity each step resets the grid.
+        Gravity is that of `stage` at the start t, s, of a step.  If it is a function, each step resets the grid.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
@@ -235,16 +235,15 @@ class Scene:
             return None
         has = {
             "is in 3D": grid.dim == 3,
-            "is axisymmetric": grid.axisymmetric,
+            "has inertia in axisymmetry": grid.axisymmetric and self.momentum.inertia is not None,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
-            "has inertia": self.momentum.inertia is not None,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }
         if found := [what for what, so in has.items() if so]:
             what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
-            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in plane strain")
+            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in 2D")
         return Renewal(self.bodies, self.materials)
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:

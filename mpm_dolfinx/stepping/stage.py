@@ -122,8 +122,8 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if the stage cannot begin at this place."""
-        for one in self.acting:
+        """Raise an error if the stage begins and cannot begin at this place."""
+        for one in self.acting if place.begins else ():
             one.check_start(place)
 
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
@@ -135,7 +135,7 @@ class Stage:
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return the names of conditions that the previous stage has too: unchanged, or with a name of the user."""
+        """Return names of conditions that are the same object in the previous stage, or whose name the user gave."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 

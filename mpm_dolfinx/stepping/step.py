@@ -10,7 +10,7 @@ import numpy as np
 
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.conditions.acting import Place
-from mpm_dolfinx.dynamics.energies import after
+from mpm_dolfinx.dynamics.energies import after, after_renewal
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
 from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, leads, left
@@ -32,9 +32,9 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all faces are cut together
     data = on_grid.data_of(state)
-    place = Place(on_grid.cut, on_grid.fill, state.points, data, state.t, dt, state.t, state.outcome, stage.inertia)
-    if state.begins:
-        stage.check_start(place)
+    now = state.t, dt, state.t, state.outcome, stage.inertia, state.begins
+    place = Place(on_grid.cut, on_grid.fill, state.points, data, *now)
+    stage.check_start(place)
     loads = [stage.placed(place._replace(t=t)) for t in times]
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
@@ -50,8 +50,8 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
-    state, earlier = start.state, None
-    on_grid = start.on_grid
+    before, state = state, start.state
+    on_grid, earlier = start.on_grid, None
     flights, found = [flight_of(start)], []
     for placed in start.acting:
         acting = start.begun(placed, earlier)
@@ -75,6 +75,6 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
     now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
-        kinetic = state.stage.kinetic(outcome)
-        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], kinetic, seconds, found)
+        energy = after_renewal(scene.materials, before.outcome["energy"], before.points, state.points, start.renewed)
+        outcome["energy"] = after(energy, scene.materials, now["points"], state.stage.kinetic(outcome), seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+"""Renewal of particle domains with inertia: masses with the old centres, and velocities with the old momenta."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.domains.refilled_cells import RefilledCells
+from mpm_dolfinx.mechanics.inertia import RATE, VELOCITY, velocity_gradients
+from mpm_dolfinx.points.cutting import Pieces, cut
+
+MOTION = VELOCITY, RATE
+"""Names of point data: velocity and rate of F."""
+
+
+class Momenta(NamedTuple):
+    """Momenta of groups of pieces; arrays over the groups."""
+
+    mass: NDArray[np.float64]  # (groups,), kg
+    centre: NDArray[np.float64]  # centre of mass (groups, 2), m
+    velocity: NDArray[np.float64]  # of the centre (groups, 2), m/s
+    angular: NDArray[np.float64]  # angular momentum about the centre (groups,), kg m^2/s
+    inertia: NDArray[np.float64]  # moment of inertia about the centre (groups,), kg m^2
+
+    @classmethod
+    def of(
+        cls, pieces: Pieces, piece: NDArray, group: NDArray, mass: NDArray, v: NDArray, L: NDArray, count: int
+    ) -> Momenta:
+        """Return the momenta of `count` groups.
+
+        piece (m,): indices in `pieces`; group (m,), mass (m,), kg: of each piece; v (n, 2), m/s, L (n, 2, 2), 1/s:
+        velocities and velocity gradients of the domains.
+        """
+        of, x = pieces.point[piece], pieces.x[piece]
+        second = pieces.second[piece]
+        whole, middle = _centre(of, mass, x, len(v))
+        at_pieces = v[of] + np.einsum("nij,nj->ni", L[of], x - middle[of])
+        whole, centre = _centre(group, mass, x, count)
+        velocity = _centre(group, mass, at_pieces, count)[1]
+        (x, y), (v_x, v_y) = (x - centre[group]).T, (at_pieces - velocity[group]).T
+        rotation = L[of] @ second
+        angular = mass * (x * v_y - y * v_x + rotation[:, 1, 0] - rotation[:, 0, 1])
+        inertia = mass * (x**2 + y**2 + second[:, 0, 0] + second[:, 1, 1])
+        return cls(whole, centre, velocity, *(np.bincount(group, values, count) for values in (angular, inertia)))
+
+
+def velocities(
+    work: RefilledCells, corners: NDArray, x: NDArray, group: NDArray, masses: tuple[NDArray, NDArray]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return velocities and their gradients in new domains: means of the old affine fields over the overlap, corrected.
+
+    The correction is a rigid motion of each group (n,), which restores its momentum and angular momentum.
+
+    corners (n, 4, 2), x (n, 2), m: of the new domains; masses, kg: of the old and of the new points.
+    """
+    points = work.points
+    n, count = len(x), int(group.max()) + 1
+    v, L = points.data[VELOCITY], velocity_gradients(points)
+    old = Momenta.of(work.pieces, *_received(work, masses[0]), v, L, count)
+    pairs = work.pairs(corners, group)
+    of, at = pairs[:2]
+    weight = pairs[2] * masses[0][of]
+    v = _centre(at, weight, v[of] + np.einsum("nij,nj->ni", L[of], x[at] - points.x[of]), n)[1]
+    L = _centre(at, weight, L[of].reshape(-1, 4), n)[1].reshape(-1, 2, 2)
+    pieces = cut(work.grid, corners, second=True)
+    of = pieces.point
+    new = Momenta.of(pieces, np.arange(len(of)), group[of], pieces.fraction * masses[1][of], v, L, count)
+    shift = old.velocity * (old.mass / new.mass)[:, None] - new.velocity
+    spin = ((old.angular - new.angular) / new.inertia)[group, None]
+    off = x - new.centre[group]
+    v = v + shift[group] + spin * np.stack([-off[:, 1], off[:, 0]], axis=1)
+    return v, L + spin[:, :, None] * [[0.0, -1.0], [1.0, 0.0]]
+
+
+def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
+    """Return masses (n,) of new domains at x (n, 2), m, shifted within each cell so that the old centre of mass stays.
+
+    group (n,): group of each new domain; old (points,): masses of the old domains.  A mass at most halves; then the
+    centre moves.  Domains outside the renewed cells are parts of one old domain, so their masses stay.
+    """
+    cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
+    received = _received(work, old)
+    centre = _centre(*received[1:], work.pieces.x[received[0]], int(group.max()) + 1)[1][:cells]
+    at, part = group[inside], mass[inside]
+    now = _centre(at, part, x[inside], cells)[1]
+    off = x[inside] - now[at]
+    second = _centre(at, part, (off[:, :, None] * off[:, None]).reshape(-1, 4), cells)[1].reshape(-1, 2, 2)
+    slope = np.einsum("nij,nj->ni", np.linalg.pinv(second, SAME, hermitian=True), centre - now)
+    more = np.einsum("ni,ni->n", slope[at], off)
+    most = np.zeros(cells)
+    np.maximum.at(most, at, np.abs(more))
+    out = mass.copy()
+    out[inside] *= 1 + more / np.maximum(1.0, 2 * most)[at]
+    return out
+
+
+def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the pieces of removed domains, their groups, and their masses (m,), from those of the points."""
+    piece, groups, share = work.into
+    return piece, groups, share * mass[work.pieces.point[piece]]
+
+
+def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
+    """Return the mass (count,) of each group (m,), and the mean (count, k) of values (m, k), weighted by mass (m,)."""
+    whole = np.bincount(group, mass, count)
+    columns = [np.bincount(group, mass * column, count) for column in values.T]
+    return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]
