@@ -7,6 +7,7 @@ from meshes import box_mesh
 from test_inertia import Bar
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.base.time_integration import GAMMA
 from mpm_dolfinx.mechanics.inertia import velocity_gradients
 from mpm_dolfinx.points.cutting import spreads
 
@@ -45,8 +46,37 @@ def bars(n, speed=0.05, drift=0.0):
     return mpm.Simulation(grid, both, [BAR], walls=walls, conditions=contacts, inertia=True, velocity=velocity)
 
 
+def fitted(n):
+    """Return the restitution of a bar of n elements, c dt = h, that strikes a wall: SDIRK2 with exact contact.
+
+    The method damps the front of the wave, so the bar leaves the wall before the whole front has come back.
+    """
+    h, k = 1 / n, np.arange(n)
+    K, M = np.zeros((2, n + 1, n + 1))
+    for i, j, stiff, heavy in ((0, 0, 1, 2), (0, 1, -1, 1), (1, 0, -1, 1), (1, 1, 1, 2)):
+        K[k + i, k + j] += stiff / h
+        M[k + i, k + j] += heavy * h / 6
+    A = np.linalg.inv(K + M / (GAMMA * h) ** 2)
+    x, v = np.zeros(n + 1), -np.ones(n + 1)
+
+    def acceleration(flight):
+        u = A @ (M @ flight / (GAMMA * h) ** 2 - K @ x)
+        u += A[0] / A[0, 0] * max(0.0, -x[0] - u[0])
+        return u, (u - flight) / (GAMMA * h) ** 2
+
+    for _ in range(round(2.6 * n)):
+        _, first = acceleration(GAMMA * h * v)
+        both = (1 - GAMMA) * h * (v + GAMMA * h * first) + GAMMA * h * (v + (1 - GAMMA) * h * first)
+        u, second = acceleration(both)
+        x, v = x + u, v + h * ((1 - GAMMA) * first + GAMMA * second)
+    return (M @ v).sum() / M.sum()
+
+
 def test_two_bars_strike_and_exchange_their_velocities():
-    """Exact: the force is rho c V for 2 L / c, then the bars part as fast as they came."""
+    """Exact: the force is rho c V for 2 L / c, then the bars part as fast as they came.
+
+    The time integration alone loses 1.5 % of the velocity, also on elements that end with the bars.
+    """
     n, speed = 40, 0.05
     s = bars(n, speed)
     force = []
@@ -56,7 +86,7 @@ def test_two_bars_strike_and_exchange_their_velocities():
     force, v, m = np.array(force), s.points.data["velocity"][:, 0], mass(s)
     first = s.points.id < s.points.id.max() // 2 + 1
     left, right = (m[on] @ v[on] / m[on].sum() for on in (first, ~first))
-    assert (right - left) / (2 * speed) > 0.97 and abs(m @ v) < 1e-14
+    assert (right - left) / (2 * speed) == pytest.approx(fitted(n), abs=0.007) and abs(m @ v) < 1e-14
     assert np.median(force[force > 0.5]) == pytest.approx(1.0, rel=1e-3)
     assert (force > 0.5).sum() / n == pytest.approx(2.0, rel=0.03)
 

@@ -195,6 +195,28 @@ def test_stages_begin_and_end_inertia_with_forces_in_balance():
     assert np.abs(s.points.x - settled).max() < 1e-3 * (10 - settled.max())
 
 
+PLATE = mpm.Tool(mpm.HalfSpace((0, 10), (0, -1)), displacement=lambda t: (0, -0.02 * min(t, 1)))
+
+
+@pytest.mark.parametrize(
+    ("load", "fluid", "change", "fastest"),
+    [
+        (mpm.Traction("top", (0, -1e5)), None, 1e-7, 1e-6),
+        (mpm.Traction("top", (0, -1e5)), mpm.Fluid(), 1e-5, 1e-4),
+        (PLATE, None, 0.02, 5e-4 / 2e-3),  # m/s: the penetration that a step may leave, over the step
+    ],
+)
+def test_the_base_bears_the_same_force_before_and_after_inertia_begins(load, fluid, change, fastest):
+    s = column(inertia=False, n=10, gravity=(0, -9.81), conditions=[load], fluid=fluid)
+    s.step(1.0)
+    before = s.wall_reactions["bottom"][1]
+    s.stage(inertia=True)
+    for _ in range(10):
+        s.step(2e-3)
+        assert s.wall_reactions["bottom"][1] == pytest.approx(before, rel=change)
+        assert np.abs(s.points.data["velocity"]).max() < fastest
+
+
 def test_a_block_falls_as_stones_do():
     grid = mpm.Grid([0, 0], [1, 4], [5, 20])
     block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.grid.grid import Grid, corner_bits, in_chunks
+from mpm_dolfinx.grid.grid import Grid, corner_bits, in_chunks, polynomial
 
 
 def followed(
@@ -41,10 +41,10 @@ def followed(
     # the last axis is the corner: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
         slots, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
-        out[0, part] = _polynomial(field, y, slots).T
+        out[0, part] = polynomial(field, y, slots).T
         h = grid.h[:, None] if grid.even else grid.sizes(cells[part]).T
         weights = 0.5 * ((y / h) ** 2 - 0.25)  # t (t - 1) / 2
-        out[1, part] = sum(weights[a] * _polynomial(bends[a], y, slots, a) for a in range(grid.dim)).T
+        out[1, part] = sum(weights[a] * polynomial(bends[a], y, slots, a) for a in range(grid.dim)).T
     return out
 
 
@@ -53,31 +53,12 @@ def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]
     return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
 
 
-def _polynomial(
-    coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
-) -> NDArray[np.float64]:
-    """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
-
-    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
-    index of the cell of each value.  With an axis `without`, the field does not depend on this axis.
-    """
-    rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
-    total = np.zeros(y.shape)
-    for k, row in enumerate(rows):
-        term = coefficients[:, k].take(slot, axis=1)
-        for a in range(len(y)):
-            if row >> a & 1:
-                term *= y[a]
-        total += term
-    return total
-
-
 def _second_differences(
     grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
     """Return, for each axis, the second differences D_a, m, along the edges of owned cells.
 
-    D_a is a polynomial of the other coordinates, with coefficients (d, 2^(d-1), cells) as in `_polynomial`.
+    D_a is a polynomial of the other coordinates, with coefficients (d, 2^(d-1), cells) as in `polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

@@ -85,6 +85,25 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
     return sums.astype(float, copy=False).reshape(*shape, size)
 
 
+def polynomial(
+    coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
+) -> NDArray[np.float64]:
+    """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
+
+    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
+    index of the cell of each value.  With an axis `without`, the field does not depend on this axis.
+    """
+    rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
+    total = np.zeros(y.shape)
+    for k, row in enumerate(rows):
+        term = coefficients[:, k].take(slot, axis=1)
+        for a in range(len(y)):
+            if row >> a & 1:
+                term *= y[a]
+        total += term
+    return total
+
+
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return, for each integer in m ranges given by `first` and `count` (m,): its range (n,), and the integer (n,)."""
     of = np.arange(len(count)).repeat(count)
