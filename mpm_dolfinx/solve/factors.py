@@ -47,7 +47,7 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve, and after changes of A; if `symmetric`, as L D L^T.
 
-    gathered: whether one process, the last one, holds the factors; this suits many solves with the same matrix.
+    gathered: whether only the last process holds the factors; this suits many solves with the same matrix.
     package: package of the factorisation; None: PETSc on one process, MUMPS on several.
     """
     if symmetric:

@@ -38,7 +38,7 @@ class Thresholds:
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
         Iterations of a solve above which a direct solver replaces multigrid, or the next tangent renews the factors of
-        the fixed-stress operator.  Renewal after 12, 25, 50 or 500 gives equally many Newton steps (footing, 9 cells).
+        the fixed-stress operator.  Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """

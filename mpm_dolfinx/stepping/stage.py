@@ -122,7 +122,7 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if the stage begins and cannot begin at this place."""
+        """Raise an error if this is the stage's first step, and the bodies' places do not allow it."""
         for one in self.acting if place.begins else ():
             one.check_start(place)
 
