@@ -30,7 +30,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 STRETCH = 0.1  # stretch of the block before its rotation
 BLOCK = 1.0  # m
-AWAY = 0.1  # m: distance from the wall without influence of the singular edges
+AWAY = 0.1  # m: distance from the wall beyond which the singular edges have no influence
 SPRINGS = 5e7  # Pa/m: springs instead of the clamp, as stiff as a third of the beam, without singularity
 COLORS = ("C1", "C0", "C2", "C4", "C5")  # one for each cell size
 

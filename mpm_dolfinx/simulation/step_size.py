@@ -44,7 +44,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""A sudden pressure change is no jump up to this multiple of the first change in the previous step, both per time."""
+"""Least (sudden pressure change / dt) of a jump, over (change / dt) in the first substep of the previous step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
@@ -288,7 +288,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         why = "without flow of fluid, velocities have no error estimate"
-        raise ValueError(f"rtol = {line(rtol)}: {why}, must be dt alone")
+        raise ValueError(f"rtol = {line(rtol)}: {why}, must be left out")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error

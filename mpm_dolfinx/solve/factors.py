@@ -204,7 +204,7 @@ class SingleFactors:
         self._solver.value[0].setUp()
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
-        """Return a solver for matrices with this sparsity pattern, a solution and a right-hand side."""
+        """Return a solver for matrices with this sparsity pattern, and vectors for solution and right-hand side."""
         A = PETSc.Mat().createAIJ(len(rows) - 1, csr=(rows, columns, np.zeros(len(columns))), comm=PETSc.COMM_SELF)
         return direct_solver(A, self._name, self._symmetric, gathered=True), *A.createVecs()
 

@@ -110,7 +110,7 @@ class Balances(NamedTuple):
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep, with `State.rest`: supports then also react to the initial stress."""
+    """Return the loads of each substep; with `State.rest`, supports also react to the initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest

@@ -142,7 +142,7 @@ def begin_stage(
     if scene.initial.given:
         gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
-        what = f"stage: add: body {add[0]}: domains of other bodies have been renewed"
+        what = f"stage: add: body {add[0]}, while domains of other bodies have been renewed"
         raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
@@ -278,7 +278,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return the points with added bodies, and those of the added bodies alone; bodies that touch others come first."""
+    """Return the points with added bodies, and those of added bodies alone; first bodies that touch placed bodies."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))

@@ -106,7 +106,7 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return changes (n, ...) in `seconds` by a polynomial through the last states; implicit: by its end rate.
+        """Return changes (n, ...) in a time (s) by the polynomial through the last states; implicit: end rate x time.
 
         If first > 0, the implicit change in a first substep of this length (s), times seconds / first, is subtracted.
         """
