@@ -91,7 +91,7 @@ def factor_of_safety(
 
     The simulation is unchanged. A scene that cannot stand need not be run: trials start from an elastic step of dt.
     Suction, as part of the effective stress, adds to the strength. Tool friction is not divided. If a thin weak surface
-    layer slides alone, the factor depends on `rtol`, by the layer's share of the load. All processes must call it.
+    layer slides alone, the factor depends on `rtol` and the layer's share of the load. All processes must call this.
 
     Parameters
     ----------
