@@ -76,7 +76,7 @@ class Frame:
 
     @property
     def run_out(self) -> float:
-        """Run-out of the bank, m."""
+        """Run-out of the bank: distance of its toe from the axis of symmetry, m."""
         return float(self.corners[:, :, 0].max())
 
 
