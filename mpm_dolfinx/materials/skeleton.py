@@ -207,7 +207,7 @@ class Skeleton:
                 values[name] = given = numbers(f"{what}(X)", given, None, allowed="numbers", test=np.isreal)
                 if given.shape[:1] != (len(X),) or (name in scalars and given.ndim > 1):
                     more = "" if name in scalars else " ..."
-                    allowed = f"one value a position, ({len(X)},{more})"
+                    allowed = f"({len(X)},{more}), one value for each position"
                     raise ValueError(f"{what}(X) has shape {given.shape}, must be {allowed}")
             elif name in scalars and np.ndim(value):
                 raise ValueError(f"{what} has shape {np.shape(value)}, must be a number or a function of X")
