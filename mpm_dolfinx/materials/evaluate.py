@@ -40,7 +40,7 @@ class LawAtPoints:
     shapes
         Shape of each parameter and state variable of the law.
     stretches
-        Size of the law's deformation gradients, 2 or 3; by default that of the grid.
+        Number of rows of the law's deformation gradients, 2 or 3; by default `grid.stretches`.
     cell_size
         Cell size passed to the law, m; by default the mean edge length of the cell that contains the point.
     """
@@ -189,7 +189,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws, time and cell size, as UFL constants; the caller sets the time.
+    """Return the arguments `BY_SCENE` of laws, time and cell size, as UFL; the caller sets the time.
 
     points: integration points of the law; on a grid of several cell sizes each of them stores the size of its cell.
     """

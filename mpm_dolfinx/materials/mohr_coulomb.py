@@ -48,7 +48,7 @@ class MohrCoulomb(Frictional):
     cohesion
         Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
-        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default that of the apex, c cot phi.
+        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default the apex stress c cot phi.
 
     Other parameters: see `Skeleton`, all by name.  State variable in `points.data`: `plastic`, the inverse plastic
     metric C_p^-1 (3, 3).

@@ -53,7 +53,7 @@ class FormsOfPart(NamedTuple):
     residual: ElementForces
     tangent: ElementMatrices | StackedElementMatrices
     local: LocalUnknowns | None  # None for laws without local unknowns
-    means: SumsOfPart | None  # None without mean dilatation
+    means: SumsOfPart | None  # sums for F-bar, None for laws without it
     dried: CellSums | None  # for laws that depend on suction, see `suction_sums`
 
 

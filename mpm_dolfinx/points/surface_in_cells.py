@@ -75,7 +75,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return for m domains in `chosen` cells: index in `cells`, corners (m, 4, 2), whether faces (m, 4) are surface."""
+        """Return for m domains in chosen cells: index in `cells`, corners (m, 4, 2), flags (m, 4) of surface faces."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
