@@ -544,7 +544,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return every law with the indices of its points, and their data for forms."""
+        """Return for every law: the law, the indices of its points, and the form data of these points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]

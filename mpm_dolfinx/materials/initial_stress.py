@@ -166,7 +166,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress (n, 3, 3), Pa, of points of a body; above: see `_above`."""
+        """Return the effective stress (n, 3, 3), Pa, of points of a body; above: results of `_above` there."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -335,7 +335,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return the points at their positions, with the elastic strains of `moved`, the same points after deformation."""
+    """Return points at their old positions, with the elastic strains of `moved`, the same points after deformation."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}

@@ -212,7 +212,7 @@ class _Return:
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the final stresses on a face, or on the edge of two faces, their derivatives, and their violation."""
+        """Return final stresses on a face, or on the edge of two faces, with their derivatives and their violations."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops

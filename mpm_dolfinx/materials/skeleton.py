@@ -219,7 +219,7 @@ class Skeleton:
         return self.kirchhoff is None
 
     def check_cells(self, cell_size: float) -> None:
-        """Raise ValueError if cells are too large for a softening law; cell_size: m."""
+        """Raise ValueError if cells are too large for a softening law; cell_size: edge length of a cell, m."""
 
     @classmethod
     def first_piola(cls, F, values: Mapping[str, object]):
@@ -272,7 +272,7 @@ class Skeleton:
 
     @property
     def nearly_incompressible(self) -> bool:
-        """Whether Q1 cells would lock; they then use the mean dilatation of each cell (`dilatation`)."""
+        """Whether Q1 cells would lock; they then use the mean dilatation of each cell (`mean_dilatation`)."""
         return self.poisson > LOCKING
 
     @property

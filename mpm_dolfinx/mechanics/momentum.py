@@ -500,7 +500,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and a list: for each of its terms the norms (parts,), N."""
+        """Return the result of `unbalanced`, and a list with the norms (parts,), N, of each of its force terms."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external

@@ -59,7 +59,7 @@ class SideLoads(Acting):
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
-        """Return the value of a load at time t, s; side: positions on its side, see `on_side`."""
+        """Return the value of a load at time t, s; side: result of `Patches.positions` for its side."""
         raise NotImplementedError
 
     def _on(
