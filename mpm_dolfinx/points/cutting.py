@@ -586,7 +586,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of each entry's successor in its group; the last has the first; group (n,): ascending."""
+    """Return the index (n,) of each entry's successor in its group, cyclically; group (n,): group index, ascending."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after

@@ -145,7 +145,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the index (n,), from 0, of each cell's part, and the number of parts; index (n, d + 1): of cell, copy."""
+    """Return the index (n,), from 0, of each cell's part, and their number; index (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)

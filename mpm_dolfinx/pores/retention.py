@@ -426,7 +426,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of tabulated (suction / the law's scale).  Source: outside it the integral is exact to a fraction of 1e-8."""
+"""Range of tabulated suctions / scale of the law.  Source: outside it the integral is exact to a fraction of 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Halving this value changes the result of scene "dry" in tests/plateaus.py by 2.1e-08
 (relative), doubling it by 2.6e-09, and finer cells by 6.6e-03.
