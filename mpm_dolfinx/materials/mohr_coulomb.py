@@ -191,7 +191,7 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses (n, 3), Pa, derivatives by trial stresses, and violations (n,); few: slice of candidates."""
+        """Return final stresses (n, 3), Pa, derivatives by trial stresses, and violations (n,); few: candidates."""
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:
