@@ -178,7 +178,7 @@ def _shape(kind: str) -> tuple[range, list, list]:
 
 
 def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return the arrays of `Polytopes` for vertices x (n, k, d) of one cell type, padded to the given numbers."""
+    """Return arrays of `Polytopes` for vertices x (n, k, d) of a type, padded to `vertices`, `facets`, `edges`."""
     _, loops, ends = _shape(kind)
     corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
     normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))

@@ -117,7 +117,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is on the left of a to b."""
+    """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is to the left of edge ab."""
     return _cross(b - a, c - a)
 
 

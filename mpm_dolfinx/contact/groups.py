@@ -37,7 +37,7 @@ class Contact:
     Raises
     ------
     ValueError
-        An invalid value.  From the scene: groups with common bodies, or a pair of groups without a contact.
+        An invalid value.  Raised by the scene: groups with common bodies, or a pair of groups without a contact.
     """
 
     one: int | Sequence[int]
