@@ -98,8 +98,8 @@ def _folder() -> Path:
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
     """Return a new folder for libraries that exists until the end of the run."""
-    allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
-    what = f"{cache}: {why.strerror}: cache folder of dolfinx's compiled forms"
+    allowed = "must be a folder that can be written; set XDG_CACHE_HOME to another"
+    what = f"cache folder of dolfinx's compiled forms, {cache}: {why.strerror}"
     try:
         folder = Path(tempfile.mkdtemp(prefix="mpm_dolfinx-"))
     except OSError as error:

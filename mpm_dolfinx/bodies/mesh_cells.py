@@ -55,7 +55,7 @@ def edges(kind: str) -> list[tuple[int, int]]:
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index in each group of equal rows of an array (n, k), and the group (n,) of each row.
+    """Return the first row in each group of equal rows of an array (n, k), and the group index (n,) of each row.
 
     Groups are sorted by row.  `np.unique` compares rows as objects and takes five times as long.
     """

@@ -264,7 +264,7 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return surface cells (n,), and for each of them another cell (n,) whose bounding box (m, 2, d) overlaps its own.
+    """Return pairs of cells, as two arrays (n,): one of the cells `outer`, and a cell whose bounding box overlaps.
 
     Boxes are grouped by size, in octaves.  Otherwise small boxes would be searched with the radius of the largest box.
     """
@@ -365,7 +365,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
         what = f"{len(np.unique(cover.face))} faces touch others without common nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}: hanging or duplicate nodes, must be merged, or belong to two parts")
+        raise ValueError(f"{name}: {what}; hanging or duplicate nodes must be merged, or belong to two parts")
 
 
 def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody:
@@ -374,7 +374,7 @@ def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
     if len(small):
-        what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s: "
+        what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s; "
         what += "they cost as much as large ones; a coarser mesh is sufficient"
         warn(grid.comm, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])
     return body

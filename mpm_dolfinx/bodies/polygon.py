@@ -67,7 +67,7 @@ def polygon(
             f"polygon: sides = {line(sides)}, must be a name for each of {len(outline)} edges, or one for all"
         )
     if not isinstance(holes or {}, Mapping) or not all(isinstance(name, str) for name in holes or {}):
-        raise ValueError(f"polygon: holes = {line(holes)}, must be a mapping: name of a hole's side -> its corners")
+        raise ValueError(f"polygon: holes = {line(holes)}, must map the name of each hole's side to the hole's corners")
     loops = [(outline, sides)]
     for name, inner in (holes or {}).items():
         inner = _outline(f"hole {name!r}", inner)

@@ -99,7 +99,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return index pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose boxes may lie within a distance."""
+    """Return indices (n,) in a (k, c, d), and in b (l, c, d), of polytopes whose boxes may lie within a distance."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))

@@ -99,7 +99,7 @@ class Place(NamedTuple):
     """Positions and times at which conditions act in a substep."""
 
     cut: CutDomains  # particle domains cut by the grid
-    fill: NDArray[np.float64]  # volume fraction of the local cells
+    fill: NDArray[np.float64]  # fraction of the volume of each local cell that bodies fill
     points: MaterialPoints  # material points at the start of the step
     pieces: Any  # quadrature points, see `QuadratureData`
     start: float  # start of the step, s

@@ -147,7 +147,7 @@ class Quiet(Condition):
     ValueError
         Raised by the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the
         side; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
-        that fixes the side; a weight that changes as the stage begins: the traction at rest does not change.
+        that fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
     side: str

@@ -12,7 +12,7 @@ from scipy.interpolate import PPoly
 from mpm_dolfinx.base.validation import flag, line, numbers, on_disk, path
 
 QUANTITIES = ("acceleration", "velocity")
-ALLOWED = "at least two rows of a time, s, which increases, and a finite value"
+ALLOWED = "two columns, increasing times in s and finite values, of at least two rows"
 
 
 class Record:

@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Material points to which contact pairs belong; arrays (n,) before pairs are sent to the owners of cells."""
+    """Material points to which contact pairs belong; arrays over n pairs, before these are sent to owners of cells."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)

@@ -40,9 +40,9 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""Stiffness k in units of (resistance) / (cell size)."""
+"""Stiffness k in units of (`resistance`) / (cell size)."""
 GRIP = 6.0
-"""Stiffness k_t in units of (resistance) / (cell size).  With a larger k_t, spurious shear stresses would alternate
+"""Stiffness k_t in units of (`resistance`) / (cell size).  With a larger k_t, spurious shear stresses would alternate
 between cells: their nodal forces cancel, so nothing would resist them.
 """
 DEPTH = 5e-4  # allowed mean penetration / cell size
@@ -196,7 +196,7 @@ class ContactLaw:
         return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return D v (m, d) for v (m, d), or with `adjoint` the product with the transpose, see `tangent`."""
+        """Return D v (m, d) for v (m, d), or D^T v with `adjoint`; D: see `tangent`."""
         area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:

@@ -105,7 +105,7 @@ class Touching(Acting):
         self.symmetric = not any(self._grips)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero histories of n points: pressures (n,), Pa, and tractions (n, d), Pa, if contacts resist slip."""
+        """Return zero histories of n points: pressures (n,), Pa; if contacts resist slip also tractions (n, d), Pa."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, grips in zip(self.names, self._grips, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}

@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell and its bodies if domains overlap in it; return the next check, None if warned."""
+    """Warn about the fullest cell and its bodies if domains overlap; return the next check, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
