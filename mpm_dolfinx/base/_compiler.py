@@ -85,7 +85,7 @@ def _folder() -> Path:
         file, why = getattr(error, "filename", None), getattr(error, "strerror", None)
         what = f"{file}: {why}" if file else f"dolfinx_jit_*.json or ffcx_*.json: {line_of(error)}"
         allowed = "must be absent, or JSON that can be read; set HOME or XDG_CONFIG_HOME to another folder"
-        raise OSError(f"settings of dolfinx, {what}, {allowed}") from error
+        raise OSError(f"{what}; settings of dolfinx {allowed}") from error
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=WORKSHOP, dir=cache):

@@ -55,7 +55,7 @@ class LatticeBody(Body):
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map.
 
-        Domains have the same digits at a shared corner: far from the origin no gap opens between them.
+        Domains have the same digits at a shared corner, so that no gap opens between them far from the origin.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 

@@ -263,7 +263,7 @@ class Tool:
         """Raise an error for an invalid rotation of a free tool."""
         of, rotates = self._uniform(dim), self.rotates(dim)
         if dim == 3 and rotates:
-            raise ValueError(f"Tool: moment = {self.moment:g}, must be left out in 3D, where tools do not rotate")
+            raise ValueError(f"Tool: moment = {self.moment:g}, must be left out, because in 3D tools do not rotate")
         if self.spin and not rotates:
             raise ValueError(f"Tool: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
         if not rotates:
