@@ -48,7 +48,7 @@ class PiecePressures:
     slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for pieces that stay
     bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for pieces that stay
     of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; None for pieces to be moved
-    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None to be moved
+    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None like `of_cell`
 
     def __post_init__(self):
         for rows in self.arrays.values():
@@ -141,9 +141,9 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return differences and slopes to neighbours and drained sides, and which neighbours and drained sides exist.
+        """Return pressure differences, Pa, and slopes, Pa/m, to neighbours or drained sides; which exist of both kinds.
 
-        All have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
+        All four arrays have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
         """
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
@@ -162,7 +162,7 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy also at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of two: that of the next cell inside, and the linear
+        In a cell at a no-flow side, the slope is the smaller of the slope in the next cell inside, and the linear
         extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
         stay between the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
 
@@ -203,7 +203,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return for each cell the largest factor (n,) <= 1 that keeps its increments (m,) within [`low`, `high`] (n,)."""
+    """Return for each cell the largest factor (n,) <= 1 that keeps increments in the cell within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
