@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices of Q1 vectors.  Sums over the points of each cell precede insertion.
-
-Inserting a matrix for every point would cost more than computing it.
-"""
+"""Nodal forces and element matrices of Q1 vectors.  Sums over the points of each cell precede insertion."""
 
 from __future__ import annotations
 
