@@ -67,7 +67,7 @@ class Patches:
         """Origin of positions (d,), m, see `Grid`."""
         around = grid.around(interpolate(faces.domain[face], xi)) if grid.axisymmetric else 1.0
         if renewed is not None:
-            around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are those of rings
+            around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are already areas of rings
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
 

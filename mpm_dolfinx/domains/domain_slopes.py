@@ -48,7 +48,7 @@ class Neighbours:
         for i, body in enumerate(bodies):
             chosen_rows = (of == i).nonzero()[0]
             corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
-            # the key of a face is the same in both domains: its lowest corner index, and that of the opposite corner
+            # the key of a face is the same in both domains: lowest corner index, and index of the opposite corner
             first = corners.argmin(axis=2)[:, :, None]
             ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
             key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)

@@ -50,8 +50,8 @@ class Lattice:
     """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
 
     start: identifier of the body's first point; given: for each condition, the faces on which it prescribes
-    displacements, and the prescribed axes; contacts: indices (m,) of the domains of faces that touch other bodies, and
-    corners (m, 4) of these faces.
+    displacements, and the prescribed axes; contacts: for faces that touch other bodies, the
+    index (m,) of the domain, and the indices (m, 4) of the corners of the face in this domain.
     """
 
     def __init__(

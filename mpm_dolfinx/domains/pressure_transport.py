@@ -216,7 +216,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, of the new pieces, or mass potentials (additive) if `old` contains these."""
+    """Return the pressures (m,), Pa, of the new pieces, or the mass potentials if `old` contains mass potentials."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -232,7 +232,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     left_fraction = old.fraction.copy()
     left_fraction[before] -= common[match]
     share = common / new.fraction
-    # rows are pressure and centroid; the centroid of a piece is relative to that of its domain
+    # rows are pressure and centroid; centroids of pieces are relative to the centroid of the domain
     sums, d = sum_by(owner, old.fraction * np.concatenate([old.slope, old.x], axis=1).T, n), old.x.shape[1]
     slope, centre = sums[:d], sums[d:]
     then = np.concatenate([old.pressure[None], old.x.T - centre[:, owner]])
@@ -249,7 +249,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor (m,) that keeps corrected pressures within the bounds, equal for all pieces of a domain."""
+    """Return the factor (m,) of corrections that keeps pressures within bounds, equal for all pieces of a domain."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)

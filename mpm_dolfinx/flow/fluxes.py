@@ -188,7 +188,7 @@ class PieceContents:
 
     cells: NDArray[np.int32]  # owned cell (m,)
     weight: NDArray[np.float64]  # volume (m,), m^d
-    area: NDArray[np.float64]  # volume (m,), m^d; in axisymmetry area of the section, m^2
+    area: NDArray[np.float64]  # volume (m,), m^d; in axisymmetry the area of the section, m^2
     x: NDArray[np.float64]  # centroid (m, d), m; in axisymmetry of the section
     faces: NDArray[np.float64]  # areas on the lower and upper faces of the cell (m, d, 2), m^(d-1)
     fixed_stress: NDArray[np.float64]  # fixed-stress coefficient beta (m,), 1/Pa
@@ -209,7 +209,7 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, m^d; and in axisymmetry areas (m,) of their sections, m^2."""
+        """Volumes (m,) of the pieces, m^d; and the same again, in axisymmetry areas of sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))

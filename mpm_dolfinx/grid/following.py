@@ -97,7 +97,7 @@ def _filled(width: NDArray[np.float64], length: float, more: float, least: float
     total = length + more
     if total < len(width) * least * (1 - SAME):
         allowed = f"must be at least {len(width) * least:.3g} m for the {len(width)} cells between them"
-        raise ValueError(f"{what}: the small cells are {total:.3g} m from a side, {allowed}")
+        raise ValueError(f"{what}, which leaves {total:.3g} m between the small cells and a side, {allowed}")
 
     def beyond(factor: float) -> float:
         return float((width * factor**power).sum() - total)

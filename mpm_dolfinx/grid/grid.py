@@ -77,7 +77,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) by index (n,), as floats (`np.bincount` may return ints)."""
+    """Return the sums (..., size) of values (..., n) of equal index (n,), as floats (`np.bincount` may return ints)."""
     shape = values.shape[:-1]
     if shape:
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
@@ -105,7 +105,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return, for each integer in m ranges given by `first` and `count` (m,): its range (n,), and the integer (n,)."""
+    """Return the range (n,) and the value (n,) of each integer in m ranges from `first` on, of `count` integers."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
