@@ -43,8 +43,8 @@ class Patches:
         Index of the face in `faces`, and index of the material point.
     cell : (n,)
         Lexicographic index of the cell.
-    x, xi : (n, d), m, -
-        Position at the last cut, and local coordinates in the domain.
+    x, xi : (n, d)
+        Position at the last cut, m, and local coordinates in the domain.
     share : (n,)
         Fraction of the face that the point represents.
     """
@@ -131,9 +131,9 @@ class CutDomains(Keyed):
         self.cells, self.x = grid.local(exchange.send(self.pieces.cell)), exchange.send(self.pieces.x)
         """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
         self.mixed = exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
-        """In 3D: mean products of the offsets of the pieces, see `Pieces`."""
+        """In 3D: mean products of the offsets in each piece from its centroid, see `Pieces`."""
         self.second = exchange.send(self.pieces.second) if second else None
-        """If `second`: mean products of all offsets of the pieces (m, d, d), m^2."""
+        """If `second`: mean products (m, d, d), m^2, of all offsets in each piece from its centroid."""
         self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
@@ -157,7 +157,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry areas, centroids of sections."""
+        """Return sizes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections in the plane."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]

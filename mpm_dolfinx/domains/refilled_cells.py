@@ -488,7 +488,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return data (n, ...) of new domains on the surface: means of point data over the old surface in a cell."""
+        """Return point data (n, ...) of new domains on the surface: means over the old surface in the same cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]

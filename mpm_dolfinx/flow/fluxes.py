@@ -214,7 +214,7 @@ class CellContents(Keyed):
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells, m^d; and the fixed-stress coefficient times the volume."""
+        """Volumes (n,) of the material in filled cells, m^d; and mean fixed-stress coefficients times these volumes."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions of material in the filled cells (n,)."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)

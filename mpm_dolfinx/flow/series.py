@@ -7,8 +7,8 @@ eliminates them.  Each soil conducts like a pair of cells that contain only this
 layers of exponential soil is therefore exact at any offset from the grid.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over the
-mean of its fractions of the replaced lines.
+cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over
+its mean fraction of the replaced lines.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Paths(NamedTuple):
     resistance: NDArray[np.float64]  # length / (mobility x fraction of lines) (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths at an index of all arrays."""
+        """Return the paths for an index that applies to all arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:

@@ -19,7 +19,7 @@ The sum over all cells is the bodies' balance.  `fluid_content` defines the chan
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
 other cells, and pressure jumps are damped (see below).  Points carry the difference, a volume defect (`owed`).  The
-next steps correct fractions of it (`defect`), at a constant rate over the step.
+next steps correct fractions of this defect (`defect`), at a constant rate over the step.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The unknowns of a step: their numbering, vectors and matrices.
 
-Functions are defined on the whole grid.  Vectors, matrices and factors contain only the free degrees of freedom of
-active nodes or cells.  In the local-to-global map all other degrees of freedom have the index -1, which PETSc ignores.
-dolfinx can therefore assemble directly into these vectors and matrices.
+Functions are defined on the whole grid.  Vectors, matrices and factorisations contain only the free degrees of freedom
+of active nodes or cells.  In the local-to-global map all other degrees of freedom have the index -1, which PETSc
+ignores.  dolfinx can therefore assemble directly into these vectors and matrices.
 """
 
 from __future__ import annotations

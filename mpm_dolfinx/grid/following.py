@@ -40,8 +40,8 @@ def lines_at(
 ) -> list[NDArray[np.float64]]:
     """Return the lines (n,), m, along each axis, from a function of time t (s) and positions x (n, d), m.
 
-    `given` are the lines with which the grid was created.  Along each axis, the new lines must have the same number,
-    and the same first and last coordinate.
+    `given` are the lines with which the grid was created.  Along each axis, the number of lines, the first and
+    the last coordinate must not change.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
