@@ -267,7 +267,7 @@ class CellContents(Keyed):
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at centroids of material; nodal displacements in m; cells `rests` stay."""
+        """Return the motion of filled cells at centroids, from displacements `nodal`, m; cells `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()

@@ -227,7 +227,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each cell the part (n,) of the factor of shifts due to inclined layers, see `_along`."""
+        """Return for each cell (n,) the part due to inclined layers of the factor that multiplies shifts, see `_along`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -321,7 +321,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of fluxes between cells (in unsaturated soil at p).  `force`: see `StorageForms`."""
+        """Assemble the flux matrix between cells (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
