@@ -80,7 +80,7 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
     """Return masses (n,) of new domains at x (n, 2), m, shifted within each cell so that the old centre of mass stays.
 
     group (n,): group of each new domain; old (points,): masses of the old domains.  A mass changes by at most half;
-    if this limit applies, the centre moves.  Outside the renewed cells each group is of one domain, and its masses stay.
+    if this limit applies, the centre moves.  Outside the renewed cells a group is of one domain, and its masses stay.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)

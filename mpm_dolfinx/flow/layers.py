@@ -227,7 +227,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each cell (n,) the part due to inclined layers of the factor that multiplies shifts, see `_along`."""
+        """Return for each cell (n,) the part due to inclined layers of the factor by which shifts are multiplied."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
