@@ -27,7 +27,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-HEIGHT, LENGTH = 10.0, 26.0  # m: height and length of the bank; length of the floor
+HEIGHT, LENGTH = 10.0, 26.0  # m: height of the bank, also its length; length of the floor
 WALL, TOP, THICK = 14.25, 8.0, 1.0  # m: position, height and thickness of the barrier
 WEIGHT = 20e3  # N/m³
 SCALE = WEIGHT * HEIGHT  # Pa
@@ -76,7 +76,7 @@ class Frame:
 
     @property
     def run_out(self) -> float:
-        """Run-out of the bank, m."""
+        """Run-out of the bank: distance of its toe from the axis of symmetry, m."""
         return float(self.corners[:, :, 0].max())
 
 

@@ -45,7 +45,7 @@ PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", tractio
 
 @dataclass
 class Outcome:
-    """The axis of the beam (k, 2), m, at each alpha, from the middle of the clamp."""
+    """The axis of the beam (k, 2), m, at each alpha, relative to the middle of the clamp."""
 
     axis: dict[int, np.ndarray]
     result: mpm.Result

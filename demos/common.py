@@ -168,7 +168,7 @@ def viscous(viscosity: float) -> Callable:
 
 
 def domains(ax, corners: np.ndarray, values: np.ndarray | None = None, **style):
-    """Draw particle domains with corners (np, 4, 2), coloured by values (np,); return matplotlib's collection."""
+    """Draw particle domains with corners (n, 4, 2), coloured by values (n,); return matplotlib's collection."""
     from matplotlib.collections import PolyCollection
 
     style = {"edgecolors": "face", "linewidth": 0.2} | style

@@ -127,7 +127,8 @@ class System:
 def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
     """Return the scene in its present state with water of another bulk modulus, Pa.
 
-    The pressures are limited to a tenth of this modulus; otherwise the density of the water would be unphysical.
+    All pressures are scaled so that they are at most a tenth of this modulus; otherwise the density of the water would
+    be unphysical.
     """
     soils, walls = s.scene.materials.materials, s.state.stage.conditions["walls"]
     other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=s.conditions)

@@ -30,7 +30,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 STRETCH = 0.1  # stretch of the block before its rotation
 BLOCK = 1.0  # m
-AWAY = 0.1  # m: distance from the wall without influence of the singular edges
+AWAY = 0.1  # m: distance from the wall beyond which the singular edges have no influence
 SPRINGS = 5e7  # Pa/m: springs instead of the clamp, as stiff as a third of the beam, without singularity
 COLORS = ("C1", "C0", "C2", "C4", "C5")  # one for each cell size
 
@@ -48,7 +48,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the rms stress of the points, Pa; stresses nearer to the wall than `away`, m, count as zero."""
+    """Return the rms stress of the points, Pa; points nearer to the wall than `away`, m, count with zero stress."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -143,7 +143,7 @@ def cycle(
 
 
 def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = None) -> float:
-    """Return the rms change of the total stress in the middle of the stretched block after a rotation by 360 degrees.
+    """Return rms change / rms of the total stress in the middle of the stretched block, by a rotation of 360 degrees.
 
     With a fluid the block is undrained.
     """

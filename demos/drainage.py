@@ -6,8 +6,8 @@ column drains at its foot.  Its retention curve is user-defined.  The effective 
 saturation.  The reference is a converged solution with 400 finite volumes, for small strain.  Source: Liakopoulos
 (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the largest pressure at this
-time.  Other errors refer to the settlement, and to the outflow at the foot.  On one process.
+Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the suction at the highest
+of them; relative errors of the settlement, and of the outflow at the foot.  On one process.
 """
 
 from __future__ import annotations

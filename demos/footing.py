@@ -121,8 +121,8 @@ class Frame:
 class Push:
     """Results of a push.
 
-    settlement, load: settlement / B and load / (B c) after each step.  frames: states at some times.  pushed: index of
-    the last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the
+    settlement, load: settlement / B and load / (area c) after each step.  frames: states at some times.  pushed: index
+    of the last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the
     initial surface of the soil.
     """
 

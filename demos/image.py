@@ -27,7 +27,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 EDGE, HOLES, CONTRAST, POROSITY = 1e-3, 0.12, 10.0, 0.8  # m; fraction of holes; stiffness ratio white to black; -
-BULK, SHEAR, CONDUCTIVITY = 2e4, 1.5e4, 1e-9  # Pa, Pa, m/s: those of black tissue
+BULK, SHEAR, CONDUCTIVITY = 2e4, 1.5e4, 1e-9  # Pa, Pa, m/s: of black tissue
 LOAD, RAMP, SMALL = 1.2e4, 1.0, 1.0  # load, Pa; time of loading, s; load for the modulus, Pa
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 TOP = ((0.0, 0.999 * EDGE), (EDGE, EDGE))  # region of the upper edge, because holes also have sides that face up

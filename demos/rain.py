@@ -14,7 +14,7 @@ Gardner's constant, gamma_w the unit weight of water, q the rain, k the conducti
 table.
 
 Source: Lu and Godt (2008) for vertical flow; here the component of gravity normal to the slope replaces gravity.
-Errors: the largest error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
+Errors: the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
 
 With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and a
 cohesion that falls to a tenth with slip stabilise the bank.  The suction decreases until equilibrium is impossible.
@@ -218,7 +218,7 @@ def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
-    """Return the largest error of the factors of safety at `DEPTHS`; the suction is zero at the water table."""
+    """Return the largest relative error of the factors of safety at `DEPTHS`; no suction at the water table."""
     at = np.interp(DEPTHS, np.append(depth, TABLE), np.append(suction_stress, 0.0))
     return float(np.abs(safety(DEPTHS, at) / exact(DEPTHS, share) - 1).max())
 

@@ -84,7 +84,7 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
 
 
 def sent() -> np.ndarray:
-    """Return numbers of messages and bytes of exchanges so far, and of messages, bytes and reductions of solvers."""
+    """Return five counts so far: messages and bytes of exchanges; messages, bytes and reductions of solvers."""
     events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
     solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)

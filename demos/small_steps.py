@@ -77,7 +77,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
     simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
     scene, (on_grid, _) = simulation.scene, simulation.scene.last
     here = on_grid.contents.filled
-    # cells contain the points of the start of the last step
+    # cells contain the points as they were at the start of the last step
     y = (grid.base + grid.midpoints[here] + on_grid.contents.centroid[here])[:, 1] + way * HEIGHT * (1 - 1 / steps)
     z, p = np.clip(1 - y / HEIGHT, 0, 1), scene.storage.p.x.array[here] / p0
     volume = scene.momentum.ghost.fill.x.array[here]

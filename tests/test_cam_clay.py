@@ -158,8 +158,8 @@ def test_the_bulk_modulus_follows_what_is_replaced_and_what_a_stage_changes():
             "initial_stress = .*, must be three normal effective stresses whose mean",
         ),
         ({"initial_stress": 1e5}, "must be three normal effective stresses"),
-        ({"bulk": 1e9}, "must be left out: it is P_0 / kappa"),
-        ({"bulk": lambda X: np.full(len(X), 1e9)}, "must be left out: it is P_0 / kappa"),
+        ({"bulk": 1e9}, "must be left out; it is P_0 / kappa"),
+        ({"bulk": lambda X: np.full(len(X), 1e9)}, "must be left out; it is P_0 / kappa"),
         ({"shear": -1.0}, "shear = -1.0, must be > 0"),
     ],
 )

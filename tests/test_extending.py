@@ -373,7 +373,7 @@ CASES = {
     "reserved name": (lambda: column(fluid=False, material=Taken(1, 1)), "the name 'weight' is taken"),
     "field of the wrong shape": (
         lambda: column(fluid=False, material=replace(SOFT, bulk=lambda X: X.mean())),
-        r"bulk\(X\) has shape \(\), must be one value a position",
+        r"bulk\(X\) has shape \(\), must be \(\d+,\), one value for each position",
     ),
     "field out of range": (
         lambda: column(fluid=False, material=replace(SOFT, bulk=lambda X: X[:, 1] - 0.5)),

@@ -179,7 +179,7 @@ def step(follow, lines=LINES, there=True):
         (lambda: step(lambda t: [[0, 1, 1.5, 2, 4], LINES[1]]), "grid: follow at t = 1 s", "4"),
         (lambda: step(lambda t: [[0, 2, 1, 2.5, 3], LINES[1]]), "lines along x", "[0, 2, 1, 2.5, 3]"),
         (lambda: step(lambda t: 1 / 0), "grid: follow at t = 1 s", "ZeroDivisionError"),
-        (lambda: step(BALL), "grid: follow", "0 m from a side"),
+        (lambda: step(BALL), "grid: follow", "0 m between"),
         (lambda: step(BALL, there=False), "grid: follow", "not in the first stage"),
         (lambda: step(BALL, [LINES[0], [0, 0.5, 1, 2, 3]]), "grid: follow", "begin at a side"),
     ],

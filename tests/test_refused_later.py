@@ -77,7 +77,7 @@ def test_numbers_in_forms_are_finite(make):
 
 
 def test_a_source_depends_on_its_test_function():
-    with pytest.raises(ValueError, match=r"sources: .* does not depend on q, must be linear in it"):
+    with pytest.raises(ValueError, match=r"sources: .* does not depend on q, must be linear in q"):
         scene(wet=True, terms=[mpm.Source(lambda points, q: 1e-6 * points.dx)])
 
 

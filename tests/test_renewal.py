@@ -457,6 +457,6 @@ def test_scenes_whose_domains_cannot_be_renewed_are_refused(options, message):
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4], axisymmetric=options.pop("axisymmetric", False))
     bodies, walls = [mpm.box(grid, [0, 0], [1.0, 0.5])], {"bottom": "xy"}
     with pytest.raises(
-        ValueError, match=f"Numerics: renewal = True: the scene {message}.*, must be of soil that yields"
+        ValueError, match=rf"Numerics\(renewal=True\): the scene {message}.*, must be of soil that yields"
     ):
         mpm.Simulation(grid, bodies, [soil], walls=walls, numerics=mpm.Numerics(renewal=True), **options)

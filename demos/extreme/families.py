@@ -58,7 +58,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return the powers of ten from 10^low to 10^high; step: of the exponent."""
+    """Return the powers of ten from 10^low to 10^high; step: increment of the exponent."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
@@ -337,7 +337,7 @@ def overload():
 
 
 def pressed(material, load: float) -> Error | None:
-    """Return the error of the settlement under a load, Pa; None if the load is in equilibrium with no stretch."""
+    """Return the error of the settlement under a load, Pa; None if no stretch is in equilibrium with the load."""
 
     def excess(a):
         lam = material.bulk - 2 * material.shear / 3

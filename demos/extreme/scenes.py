@@ -47,7 +47,7 @@ Make = Callable[[], Scene]
 
 
 def off(measured, exact, scale: float | None = None) -> float:
-    """Return the largest difference, divided by `scale`, or by default by the largest exact value."""
+    """Return the largest difference, divided by `scale`, which is by default the largest exact value."""
     return float(np.abs(np.subtract(measured, exact)).max() / (np.abs(exact).max() if scale is None else scale))
 
 
@@ -92,7 +92,7 @@ class Beam:
     offset: float = 0.5  # distance of the underside from a grid line, divided by the cell size
     per_cell: int = 2
     angle: float = 0.0  # degrees: rotation of beam and loads about the middle of the left end
-    truth: tuple[int, int] = (40, 16)  # Taylor-Hood elements
+    truth: tuple[int, int] = (40, 16)  # numbers of Taylor-Hood elements along and across the beam
     truth_steps: int = 8  # steps of these elements if no water drains, otherwise `steps`
 
     def physics(self) -> dict:
@@ -135,7 +135,7 @@ class Beam:
 
 @cache
 def finite_elements(beam: Beam, element: str) -> np.ndarray:
-    """Return the displacement (2,), m, of the tip of the beam with `beam.truth` finite elements."""
+    """Return the displacement (2,), m, of the tip of the beam on a mesh of `beam.truth` finite elements."""
     fem = BiotFEM([0, 0], beam.size, beam.truth, beam.material, walls={"left": "xy"}, element=element, **beam.physics())
     return tip(fem.run(beam.end, beam.end / beam.steps, probes=[[beam.size[0], beam.size[1] / 2]]))
 

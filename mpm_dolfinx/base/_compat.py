@@ -148,7 +148,7 @@ class CompiledForm:
     """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 
     A cell may occur several times in the list; the kernel is then called once for each entry.  Ghost cells are not
-    allowed, because dolfinx 0.5 silently skips them.  This release needs mesh tags, later ones a list of entities.
+    allowed, because dolfinx 0.5 silently skips them.  Release 0.5 needs mesh tags, later ones a list of entities.
 
     Parameters
     ----------
@@ -217,18 +217,18 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return the coefficients as packed by dolfinx, one row per entity."""
+        """Return the coefficients as packed by dolfinx: arrays with one row for each entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`, without communication.  `rows`, one per entity, replace dolfinx's coefficients."""
+        """Add the vector to `b`, without communication.  rows: coefficients of the entities; default: `packed`."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix, in unrolled dofs, to `A` without final assembly.  `rows` replace dolfinx's coefficients."""
+        """Add the matrix, in unrolled dofs, to `A` without final assembly; rows: as for `assemble_vector`."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)

@@ -84,8 +84,8 @@ def _folder() -> Path:
     except (OSError, ValueError) as error:  # ValueError: not JSON
         file, why = getattr(error, "filename", None), getattr(error, "strerror", None)
         what = f"{file}: {why}" if file else f"dolfinx_jit_*.json or ffcx_*.json: {line_of(error)}"
-        allowed = "must be absent, or JSON that can be read: set HOME or XDG_CONFIG_HOME to another folder"
-        raise OSError(f"{what}: settings of dolfinx, {allowed}") from error
+        allowed = "must be absent, or JSON that can be read; set HOME or XDG_CONFIG_HOME to another folder"
+        raise OSError(f"{what}; settings of dolfinx {allowed}") from error
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=WORKSHOP, dir=cache):
@@ -98,8 +98,8 @@ def _folder() -> Path:
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
     """Return a new folder for libraries that exists until the end of the run."""
-    allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
-    what = f"{cache}: {why.strerror}: cache folder of dolfinx's compiled forms"
+    allowed = "must be a folder that can be written; set XDG_CACHE_HOME to another"
+    what = f"cache folder of dolfinx's compiled forms, {cache}: {why.strerror}"
     try:
         folder = Path(tempfile.mkdtemp(prefix="mpm_dolfinx-"))
     except OSError as error:
@@ -113,8 +113,6 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
     """Return a version of FFCx's compiling function `make` that leaves only complete libraries in `folder`.
 
     Errors of the compiler and of the disk are appended to `messages`.
-
-
     """
 
     def find_or_make(*objects, cache_dir, **settings):

@@ -76,11 +76,11 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from columns (name -> values (n, ...)) and outcomes (n,); raise ValueError if lengths differ."""
+        """Return rows of columns (name -> values (n, ...)) and outcomes (n,); raise ValueError if they do not match."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:
-            raise ValueError("columns differ in length")
+            raise ValueError("columns and outcomes differ in length")
         out = cls()
         arrays = {name: np.array(columns[name], dtype=np.float64) for name in COLUMNS}
         out._columns, out._count = _Columns(arrays, list(outcomes)), len(outcomes)

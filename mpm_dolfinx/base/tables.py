@@ -34,7 +34,7 @@ def components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.f
 
 
 def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
-    """Return values and unit of each column by name, for one output time or all output times."""
+    """Return the columns by name, each as (values, unit), for one output time or all output times."""
     dim, rank = of.displacement.shape[-1], np.ndim(of.t)
     out = {"t": (of.t, "s")}
     for k, name in enumerate(("p_min", "p_max")[: of.pressure.shape[-1]]):

@@ -45,7 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements.  An entry is a pair: name of an instance or "", and element numbers or name of another set."""
+    """A set of elements.  Each entry is (name of an instance or "", element numbers or name of another set)."""
 
     name: str
     internal: bool

@@ -103,7 +103,7 @@ class Body:
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
+        """Return means over the body: number of domains in a row along an axis, and their edge length along it, m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -130,7 +130,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the largest distances (m,), m, between straight edges of chosen domains and the mapped edges of boxes.
+        """Return for each chosen domain the largest distance (m,), m, between its straight edges and mapped box edges.
 
         Distances are between midpoints.  Edges of two domains on the same curve may differ by this distance.
         """

@@ -55,7 +55,7 @@ class LatticeBody(Body):
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map.
 
-        Domains have the same digits at a shared corner: far from the origin no gap opens between them.
+        Domains have the same digits at a shared corner, so that no gap opens between them far from the origin.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
@@ -126,7 +126,7 @@ class RowsBody(LatticeBody):
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length there, m."""
+        """Return means over the body: number of domains in a row along an axis, and their edge length along it, m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
@@ -153,7 +153,7 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return whole numbers of rows, at least 1; last digits of coordinates do not decide about halves."""
+    """Return numbers of rows, rounded to integers >= 1.  Rounding errors of coordinates do not decide about halves."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 
@@ -189,7 +189,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         for name, x in (("lower", lower), ("upper", upper))
     )
     if not (upper > lower).all():
-        raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}: upper must be > lower")
+        raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}, upper must be > lower")
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
     if not grid.even:
         rows = [_rows(grid, a, lower[a], upper[a], per_cell) for a in range(grid.dim)]

@@ -46,7 +46,7 @@ class Surface:
     # corners of the free part in local coordinates of the domain in [-1, 1] (m, 2^(d-1), d); triangles repeat the last
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
-    before: NDArray[np.float64]  # reference positions of these corners, before all maps (m, 2^d, d), m
+    before: NDArray[np.float64]  # reference positions of the domain's corners, before all maps (m, 2^d, d), m
     region: NDArray[np.float64]  # box of reference positions that limits the faces (2, d), m
 
     def __len__(self) -> int:
@@ -91,7 +91,7 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), m, at local coordinates xi (n, d) of the faces with indices `at`."""
+        """Return the reference positions (n, d), m, at local coordinates xi (n, d) of the domains in rows `at` (n,)."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
@@ -211,7 +211,7 @@ def _limited(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Limit parts of faces to a region; return for each limited part its face (m,), and corners xi as in `Surface`.
 
-    `row` and `face` (k,) are domains and face indices.  Part i lies on face `part[i]` (n,) and has corners t (n, 4, 2).
+    `row` and `face` (k,) are domains and face indices.  Part i of n lies on face `part[i]`, with corners t[i] (4, 2).
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
@@ -307,7 +307,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return local coordinates xi (n, 3), with the tangential parts of positions x (n, 3) projected onto faces (n,)."""
+    """Return xi (n, 3) with tangential components from the projections of positions x (n, 3), m, onto faces (n,)."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

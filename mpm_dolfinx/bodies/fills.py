@@ -35,7 +35,7 @@ class Contact:
     own: Faces  # faces of the fill on this side
     other: Faces  # surface faces of the body
     cover: Cover  # pairs of these faces in contact
-    moved: NDArray[np.float64]  # displacement since seeding of the corners of the body's faces (n, 4, d), m
+    moved: NDArray[np.float64]  # displacement of the corners of the body's faces since seeding (n, 4, d), m
 
     def area(self) -> float:
         """Return the contact area, m^(d-1)."""
@@ -47,7 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill lie on paired faces, and there the body's displacement (n, 4, d)."""
+        """Return which corners (n, 4) of the fill lie on paired faces, and the body's displacement there (n, 4, d)."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
@@ -177,7 +177,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements (n,) along an axis: u at fixed nodes, at other nodes the equilibrium of springs K."""
+    """Return the displacements (n,) along an axis: u at fixed nodes, elsewhere in equilibrium by spring stiffness K."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)

@@ -55,7 +55,7 @@ def edges(kind: str) -> list[tuple[int, int]]:
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index in each group of equal rows of an array (n, k), and the group (n,) of each row.
+    """Return the first row in each group of equal rows of an array (n, k), and the group index (n,) of each row.
 
     Groups are sorted by row.  `np.unique` compares rows as objects and takes five times as long.
     """
@@ -178,7 +178,7 @@ def _shape(kind: str) -> tuple[range, list, list]:
 
 
 def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return the arrays of `Polytopes` for vertices x (n, k, d) of one cell type, padded to the given numbers."""
+    """Return arrays of `Polytopes` for vertices x (n, k, d) of a type, padded to `vertices`, `facets`, `edges`."""
     _, loops, ends = _shape(kind)
     corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
     normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))

@@ -195,7 +195,7 @@ def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: s
 
 def _warn_curved(grid: Grid, name: str, count: int, off: float) -> None:
     """Warn about second-order cells, which are reduced to their corners."""
-    what = "%s: %d cells are of second order: only their corners are used, with straight edges; edge nodes lie "
+    what = "%s: %d cells are of second order; only their corners are used, with straight edges; edge nodes lie "
     warn(grid.comm, ResolutionWarning, what + "up to %.2g m off the midpoints", name, count, off)
 
 

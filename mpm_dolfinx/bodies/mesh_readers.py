@@ -56,7 +56,7 @@ def check_systems(mesh: meshio.Mesh) -> None:
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return cell indices of sets by name, from 0 in each block.  For FLAC3D, meshio counts through all blocks."""
+    """Return the cell indices of sets, which start at 0 in each block.  meshio's indices for FLAC3D files do not."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

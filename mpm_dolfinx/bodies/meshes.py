@@ -169,7 +169,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return domains (n, 2^d, d), nodes (n, 2d, 2^(d-1)) of the facet containing each face, and cells of the domains.
+    """Return tuples: domains (n, 2^d, d), nodes (n, 2d, 2^(d-1)) of the facet that contains each face, cells (n,).
 
     Nodes of a facet ascend; a -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
     """
@@ -221,7 +221,7 @@ def _check_sides(
     if same.any():
         nodes = facets[same.argmax()]
         x, what = mesh.x[nodes[nodes >= 0]].mean(axis=0), "have both of their cells on one side, the first at"
-        raise ValueError(f"{name}: {same.sum()} facets {what} {x}: cells must not overlap")
+        raise ValueError(f"{name}: {same.sum()} facets {what} {x}; cells must not overlap")
 
 
 def _check_overlaps(
@@ -264,7 +264,7 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return surface cells (n,), and for each of them another cell (n,) whose bounding box (m, 2, d) overlaps its own.
+    """Return pairs of cells, as two arrays (n,): one of the cells `outer`, and a cell whose bounding box overlaps.
 
     Boxes are grouped by size, in octaves.  Otherwise small boxes would be searched with the radius of the largest box.
     """
@@ -313,7 +313,7 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct facets (m, k), and the facet of each face (n, 2d).  Facet 0 stands for faces inside cells."""
+    """Return the distinct facets (m, k), and each face's facet index (n, 2d).  Facet 0 is for faces inside cells."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
@@ -332,9 +332,9 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Divide domains that are too large for the grid; return corners (m, 2^d, d), original domains (m,), outer faces.
+    """Divide domains that are too large; return corners (m, 2^d, d), m, original domains (m,), and a mask of faces.
 
-    The last array (m, d, 2) tells which faces of a new domain lie on faces of the original domain.
+    The mask (m, d, 2) tells which faces of a new domain lie on faces of the original domain.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
@@ -365,7 +365,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
         what = f"{len(np.unique(cover.face))} faces touch others without common nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}: hanging or duplicate nodes, must be merged, or belong to two parts")
+        raise ValueError(f"{name}: {what}; hanging or duplicate nodes must be merged, or belong to two parts")
 
 
 def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody:
@@ -374,7 +374,7 @@ def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
     if len(small):
-        what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s: "
+        what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s; "
         what += "they cost as much as large ones; a coarser mesh is sufficient"
         warn(grid.comm, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])
     return body

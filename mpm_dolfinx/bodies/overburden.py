@@ -22,7 +22,7 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
 
-    Both are means over vertical lines close to a position, on all sides, because borders of domains may lie above it.
+    Both are means over vertical lines on all sides close to a position, because a border of domains may lie above it.
 
     corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
     N/m^3: unit weights of the domains; x (m, d), m: positions in the domains.
@@ -64,9 +64,9 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield indices (k,) of vertical lines that cross a face of their domain (m, 2^d, d), with heights and signs (k,).
+    """Yield for each face: indices (k,) of the vertical lines that cross it, heights (k,), m, and signs (k,).
 
-    `at` (m, d-1) are the positions of the lines.  A sign is 1 where the line leaves the domain upwards, else -1.
+    Line i is at `at[i]` (d-1,); its domain has `corners[i]` (2^d, d).  A sign is 1 if the line leaves upwards, else -1.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

@@ -67,7 +67,7 @@ def polygon(
             f"polygon: sides = {line(sides)}, must be a name for each of {len(outline)} edges, or one for all"
         )
     if not isinstance(holes or {}, Mapping) or not all(isinstance(name, str) for name in holes or {}):
-        raise ValueError(f"polygon: holes = {line(holes)}, must be a mapping: name of a hole's side -> its corners")
+        raise ValueError(f"polygon: holes = {line(holes)}, must map the name of each hole's side to the hole's corners")
     loops = [(outline, sides)]
     for name, inner in (holes or {}).items():
         inner = _outline(f"hole {name!r}", inner)
@@ -117,7 +117,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is on the left of a to b."""
+    """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is to the left of edge ab."""
     return _cross(b - a, c - a)
 
 

@@ -99,7 +99,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return index pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose boxes may lie within a distance."""
+    """Return indices (n,) in a (k, c, d), and in b (l, c, d), of polytopes whose boxes may lie within a distance."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -187,7 +187,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces (m,) as triangles: for each its face (n,) and corners (n, 3, 2) in [0, 1]."""
+    """Return free parts of faces (m,) as triangles: face (n,) and corners (n, 3, 2), in [0, 1], of each triangle."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -253,7 +253,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis; return parts below and above, with their faces."""
+    """Divide triangles (3, e, n) at a plane normal to an axis; return parts below, owners, parts above, owners."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -266,10 +266,10 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rectangles of faces that no box covers: for each its face (m,), lower and upper corner (m, 2).
+    """Return the rectangles of faces that no box covers: face (m,), lower and upper corner (m, 2) of each rectangle.
 
-    count: number of faces; face (n,): faces; low, high (n, 2): corners of the boxes that cover parts of these faces, in
-    face coordinates from 0 to 1; slack (n,): largest difference between the ends of boxes that count as equal.
+    count: number of faces; face (n,): index of the face that each box covers in part; low, high (n, 2): corners of the
+    boxes, in face coordinates from 0 to 1; slack (n,): largest difference between ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)

@@ -73,7 +73,7 @@ class Setting:
     """Data that all conditions of a stage share."""
 
     sides: Sides  # finds the faces of conditions
-    free: NDArray[np.bool_]  # components of nodes that no wall fixes (nodes, d)
+    free: NDArray[np.bool_]  # whether no wall fixes a displacement component (nodes, d)
     materials: SceneMaterials  # of the scene
     forms: FormsOf  # compiled forms of the scene's conditions
     conditions: Mapping[str, Any]  # all conditions of the stage, by name
@@ -99,7 +99,7 @@ class Place(NamedTuple):
     """Positions and times at which conditions act in a substep."""
 
     cut: CutDomains  # particle domains cut by the grid
-    fill: NDArray[np.float64]  # volume fraction of the local cells
+    fill: NDArray[np.float64]  # fraction of the volume of each local cell that bodies fill
     points: MaterialPoints  # material points at the start of the step
     pieces: Any  # quadrature points, see `QuadratureData`
     start: float  # start of the step, s
@@ -164,7 +164,7 @@ class Loads:
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """Return two powers at u on this process, W: the dissipation by slip, and a correction of the external power.
 
-        Without it, the external power is that of the forces in `push` at the nodal velocities v, a local array, m/s.
+        The external power is first computed from the forces in `push` and the nodal velocities v, a local array, m/s.
         """
         return 0.0, 0.0
 
@@ -225,7 +225,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,) on walls, unrolled, and loads (n,), N, there that are not part of the reactions."""
+        """Return local dofs (n,) on walls, unrolled, and their loads (n,), N, which are not part of wall reactions."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -273,7 +273,7 @@ class Loads:
     ) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d), m, moved out of forbidden regions.
 
-        `free` (n, 2^d, d) are the components that no other condition prescribes.  By default only small penetrations
+        `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations
         are corrected; with `everywhere`, penetrations of any depth.
         """
         return corners
@@ -283,8 +283,8 @@ class Loads:
     ) -> NDArray[np.float64]:
         """Return new corners (m, 2^d, d), m, of re-initialised domains: on prescribed sides, the tracked corners.
 
-        `ids` (m,) are the points, `tracked` the tracked corners, `corners` the corners initialised from F, and `volume`
-        (m,), m^d, the volumes.  A domain with a face on a prescribed side becomes a prism of its volume.
+        `ids` (m,) identify the points; `tracked` are the tracked corners, `corners` the corners initialised from F, and
+        `volume` (m,), m^d, the volumes.  A domain with a face on a prescribed side becomes a prism of its volume.
         """
         return corners
 

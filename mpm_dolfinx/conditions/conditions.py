@@ -79,7 +79,7 @@ class Traction(Condition):
     Raises
     ------
     ValueError
-        From the scene or the step: no point lies on the side, or the value is invalid.
+        Raised by the scene or a step: no point lies on the side, or the value is invalid.
     """
 
     side: str
@@ -145,9 +145,9 @@ class Quiet(Condition):
     Raises
     ------
     ValueError
-        From the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the side;
-        another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid that
-        fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
+        Raised by the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the
+        side; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
+        that fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
     side: str
@@ -179,7 +179,7 @@ class OnSide(Condition):
     Raises
     ------
     ValueError
-        From the scene: the function is invalid, or no point lies on the side.
+        Raised by the scene: the function is invalid, or no point lies on the side.
     """
 
     side: str
@@ -241,8 +241,8 @@ class Drained(Condition):
     Raises
     ------
     ValueError
-        The pressure is not finite.  From the scene: no fluid; no point on the side; another `Drained` or `Inflow` on
-        the same part of a face.
+        The pressure is not finite.  Raised by the scene: no fluid; no point on the side; another `Drained` or `Inflow`
+        on the same part of a face.
     """
 
     side: str
@@ -375,7 +375,7 @@ class Tied(Condition):
     Raises
     ------
     ValueError
-        From the scene: the sides are not opposite, or their faces differ; another `Tied`, a `Quiet`, `Drained`,
+        Raised by the scene: the sides are not opposite, or their faces differ; another `Tied`, a `Quiet`, `Drained`,
         `Inflow` or `Rain` on the same part of a face.
     """
 
@@ -441,8 +441,8 @@ class Displacement(Condition):
     Raises
     ------
     ValueError
-        From the scene or the step: no point on the side; invalid value or components; a moving component that a wall
-        fixes; another `Displacement` of the component on the same part of a face, or other values at a common edge.
+        Raised by the scene or a step: no point on the side; invalid value or components; a moving component that a wall
+        fixes; another `Displacement` of the component on the same part of a face, or different values at an edge.
     """
 
     side: str
@@ -491,8 +491,8 @@ class RigidPlate(Condition):
     Raises
     ------
     ValueError
-        The force is not finite.  From the scene or the step: no point on the side; faces that are not connected or not
-        coplanar (define one plate, with a region, for each part).
+        The force is not finite.  Raised by the scene or a step: no point on the side; faces that are not connected or
+        not coplanar (define one plate, with a region, for each part).
     """
 
     side: str

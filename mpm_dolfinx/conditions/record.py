@@ -12,7 +12,7 @@ from scipy.interpolate import PPoly
 from mpm_dolfinx.base.validation import flag, line, numbers, on_disk, path
 
 QUANTITIES = ("acceleration", "velocity")
-ALLOWED = "two columns of at least two rows: increasing times, s, and finite values"
+ALLOWED = "two columns, increasing times in s and finite values, of at least two rows"
 
 
 class Record:

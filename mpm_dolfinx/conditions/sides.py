@@ -115,7 +115,7 @@ class Sides:
     def check_moves(self, one, holds: Iterable[Displacement], free: NDArray[np.bool_]) -> None:
         """Raise ValueError if a displacement or a wall of the grid fixes all components of faces of a condition.
 
-        `holds` are the prescribed displacements of the stage; `free` (nodes, d) are components that no wall fixes.
+        `holds` are the prescribed displacements of the stage; `free` (nodes, d) tells which components no wall fixes.
         """
         faces, grid = self.of(one), self.grid
         for hold in holds:

@@ -73,7 +73,7 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
     """Warn about each water level whose unit weight differs from that of the pore fluid.
 
-    In a dry scene, warn about each level whose unit weight is not that of water under the scene's gravity.
+    In a dry scene, warn about each level with the default unit weight, unless gravity gives water this unit weight.
 
     levels: name and water pressure of each level.
     """
@@ -86,13 +86,13 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
-            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            what = f"{what}: at equal levels, these waters are not in equilibrium"
+            what = "%s: unit_weight = %.6g N/m^3, but density times gravity of %s is %.6g, so at equal "
+            what = f"{what}levels the two are not in equilibrium"
             warn(comm, ConditionWarning, what, name, weight, of, own)
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the last gravity, m/s^2, if conductivities are converted with another one, else None.
+    """Return the last gravity, m/s^2, if conductivities are converted with another gravity, else None.
 
     gravity, m/s^2: at the start of a step, and at times in the step.  A varying gravity counts only above 9.81 m/s^2.
     """

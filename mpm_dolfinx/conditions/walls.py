@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Walls of the grid: components that they fix, and their forces on the bodies.
+"""Walls of the grid: displacement components that they fix, and their forces on the bodies.
 
 In all functions `walls` maps names of walls to the components that each fixes.
 """
@@ -32,14 +32,14 @@ def fixed_nodes(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
         raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
     for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
-            raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
+            raise ValueError(f"walls: {wall!r} fixes {axes!r}, must fix some of {'xyz'[:d]!r}")
         for a in axes:
             out[grid.wall_nodes(wall), "xyz".index(a)] = True
     return out
 
 
 def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of domain corners at walls the walls fix."""
+    """Return which displacement components (n, 2^d, d) walls fix, at corners of domains that lie on the walls."""
     out = np.zeros(corners.shape, dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
@@ -52,7 +52,7 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, clipped to fixed walls; and to other sides, if they were inside `before`."""
+    """Return corners (n, 2^d, d), m, moved back into the grid if walls fix the normal or `before` is in the grid."""
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]

@@ -41,7 +41,7 @@ class FreeMotion(NamedTuple):
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     motion: NDArray[np.float64]  # motion of the tools at w (k, q), m and rad
-    shift: NDArray[np.float64]  # Newton increment of this motion (k, q), m and rad
+    shift: NDArray[np.float64]  # Newton increment of `motion` (k, q), m and rad
     inverse: NDArray[np.float64]  # S^-1 (k, q, q); its product with further forces is added to the motion
     found: Found  # contact at w
 
@@ -226,7 +226,7 @@ class FreeTools(ContactProblem):
         return True
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Adds velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
+        """See `Loads`.  Free tools also have velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
         out = super().outcome(at)
         d, names = self.grid.dim, self.now.law.names
         motion, velocity = self.pushes.start + self.found(at).motion, self._after(at).velocity

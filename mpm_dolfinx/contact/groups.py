@@ -37,7 +37,7 @@ class Contact:
     Raises
     ------
     ValueError
-        An invalid value.  From the scene: groups with common bodies, or a pair of groups without a contact.
+        An invalid value.  Raised by the scene: groups with common bodies, or a pair of groups without a contact.
     """
 
     one: int | Sequence[int]
@@ -73,7 +73,7 @@ class Contact:
             found.append(tuple(sorted({int(i) for i in value.ravel()})))
         if common := set(found[0]) & set(found[1]):
             what = f"Contact: body {min(common)} is in one = {line(self.one)} and in other = {line(self.other)}"
-            raise ValueError(f"{what}, must be in one of them: a body does not touch itself")
+            raise ValueError(f"{what}, must be in one of them, because a body does not touch itself")
         return found[0], found[1]
 
 

@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Material points to which contact pairs belong; arrays (n,) before pairs are sent to the owners of cells."""
+    """Material points to which contact pairs belong; arrays over n pairs, before these are sent to owners of cells."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with means, over the pairs of each, of pressures `push` (m,) and tractions `shear`, Pa."""
+        """Return the points with area-weighted means over their pairs: pressures `push`, tractions `shear`, Pa."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -63,7 +63,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Return the origin of the flagged pairs (m,) of two contacts, and the order of these pairs in the origin."""
+    """Return the origin of the pairs that `kept` flags, and indices that sort these pairs as its exchange does."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

@@ -40,9 +40,9 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""Stiffness k in units of (resistance) / (cell size)."""
+"""Stiffness k in units of (`resistance`) / (cell size)."""
 GRIP = 6.0
-"""Stiffness k_t in units of (resistance) / (cell size).  With a larger k_t, spurious shear stresses would alternate
+"""Stiffness k_t in units of (`resistance`) / (cell size).  With a larger k_t, spurious shear stresses would alternate
 between cells: their nodal forces cancel, so nothing would resist them.
 """
 DEPTH = 5e-4  # allowed mean penetration / cell size
@@ -61,10 +61,10 @@ class ContactState:
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
     resticks: NDArray[np.bool_]  # whether the condition has returned from slip to stick (k,)
-    parts: NDArray[np.bool_]  # whether the condition has opened after this return (k,)
+    parts: NDArray[np.bool_]  # whether the condition has opened after a return to stick (k,)
     stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
-    # factor on the stiffness k, penetration after the last augmentation, cells, and numbers of augmentations and of
-    updates: NDArray[np.float64]  # updates of the pairs (k, 4): the same for all conditions of a connected part
+    # (k, 4): factor on the stiffness k, penetration / cell size after the last augmentation, number of augmentations,
+    updates: NDArray[np.float64]  # number of updates of the pairs; the same for all conditions of a connected part
 
     @property
     def slips(self) -> NDArray[np.bool_]:
@@ -118,14 +118,14 @@ class ContactLaw:
         return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (k, ...) of values (m, ...) of the pairs of each condition."""
+        """Return the sums (k, ...) of values (m, ...) over the pairs of each condition."""
         size = len(self.area)
         columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
         out = np.stack([sum_by(self.of, column, size) for column in columns], axis=1)
         return out.reshape(size, *values.shape[1:])
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the area-weighted means (k, ...) of values (m, ...) of the pairs of each condition."""
+        """Return the area-weighted means (k, ...) of values (m, ...) over the pairs of each condition."""
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
@@ -196,7 +196,7 @@ class ContactLaw:
         return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return D v (m, d) for v (m, d), or with `adjoint` the product with the transpose, see `tangent`."""
+        """Return D v (m, d) for v (m, d), or D^T v with `adjoint`; D: see `tangent`."""
         area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:
@@ -243,7 +243,7 @@ class ContactLaw:
         message = ""
         for k in np.flatnonzero((most > DEPTH) & (off == most) & (state.updates[:, 2] == ROUNDS))[:1]:
             name, where = line(self.contacts[self.key[k] // self.grid.num_local]), x[self.of == k][0] + self.grid.base
-            message = f"{name}: at {where} penetrates by {most[k]:.2g} cells: does a wall fix the body there?"
+            message = f"{name}: penetrates by {most[k]:.2g} cells at {where}; does a wall fix the body there?"
         if message := first(self.grid.comm, message):
             raise NotConverged(message)
         # the pore fluid, or a nearly incompressible body, is stiffer than k
@@ -277,7 +277,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep deviations of shear tractions from the mean in a cell; repeated averaging causes creep.
+        In stick, pairs keep deviations of shear tractions from the mean in a cell, as repeated averaging causes creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

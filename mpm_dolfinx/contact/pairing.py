@@ -68,7 +68,7 @@ class Pairs(NamedTuple):
 
     row: NDArray[np.int64]  # index of the point among the quadrature points of this process (m,)
     facet: NDArray[np.int64]  # index in `Facets` of a point on the opposite face (m,)
-    t: NDArray[np.float64]  # coordinates of the opposite position on this face, in [0, 1] (m, 2)
+    t: NDArray[np.float64]  # coordinates of the opposite position on its face, in [0, 1] (m, 2)
     gap: NDArray[np.float64]  # distance along the normal at the point (m,), m
 
 

@@ -65,7 +65,7 @@ class Pairs:
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return lexicographic cells (m,) of other sides that deform, and their shape functions (m, 2^d), or None."""
+        """Return lexicographic cells (m,) of opposite positions, and shape functions (m, 2^d) there; None on tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -83,7 +83,7 @@ class ToolPairs(Pairs):
     tools: Sequence[Tool]  # (contacts,)
     poses: Sequence[Pose]  # poses of tools at the end of the substep, without motion by loads in the step (contacts,)
     now: NDArray[np.float64]  # position of the point at the start of the step (m, d), m
-    carried: NDArray[np.float64]  # this position after the motion of the tool (m, d), m
+    carried: NDArray[np.float64]  # position `now` after the motion of the tool (m, d), m
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
@@ -157,7 +157,7 @@ def at_nodes(
     value: NDArray[np.float64],
     other: NDArray[np.int64] | None = None,
 ) -> PETSc.Mat:
-    """Return the matrix with d rows for each pair: its values (m, 2^d), in the columns of a component at its cell.
+    """Return the matrix (m d, unknowns) with entries `value` (m, 2^d) at the nodes of a cell, for each component.
 
     `other` are lexicographic cells of any process.  With `other`, values (m, 2 * 2^d) include the nodes of these cells.
     """
@@ -177,7 +177,7 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return the matrix with these rows of this process and `columns` local columns.  `own`: indices are local."""
+    """Return the matrix with `rows` on this process and `columns` local columns.  `own`: column indices are local."""
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
@@ -192,4 +192,4 @@ def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) 
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):
         what = f"{line(tool)}: shape has slope {size[wrong[0]]:.3g} at {x[wrong[0]]}"
-        raise ValueError(f"{what}, must be a signed distance: of slope 1 near the tool")
+        raise ValueError(f"{what}, must be a signed distance, with slope 1 near the tool")

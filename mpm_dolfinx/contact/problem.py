@@ -63,7 +63,7 @@ class LinearMotion:
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
-    shift: NDArray[np.float64]  # Newton increment of these displacements (k,), m
+    shift: NDArray[np.float64]  # Newton increment of `motion` (k,), m
     slope: NDArray[np.float64]  # derivative by the relative displacements of each pair (m, d)
 
 
@@ -105,7 +105,7 @@ class Touching(Acting):
         self.symmetric = not any(self._grips)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero histories of n points: pressures (n,), Pa, and tractions (n, d), Pa, if contacts resist slip."""
+        """Return zero histories of n points: pressures (n,), Pa; if contacts resist slip also tractions (n, d), Pa."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, grips in zip(self.names, self._grips, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
@@ -216,7 +216,7 @@ class ContactProblem(Loads):
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the entries of `coupling` in the step, beyond the entries of cells, or None."""
+        """Return a zero matrix with the entries that `coupling` may have outside the pattern of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
         for number in self._loaded:
             own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
@@ -367,9 +367,9 @@ class ContactProblem(Loads):
         _, touches = self._seek(found)
         failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(failed)[:1]:
-            why = f"the reaction is {reaction[k]:.6g} N for any displacement: do the bodies constrain the tool?"
+            why = f"the reaction is {reaction[k]:.6g} N for any displacement; do the bodies constrain the tool?"
             if reaction[k] == 0:
-                why = "there is no contact within a cell: does the tool start at the surface of a body?"
+                why = "there is no contact within a cell; does the tool start at the surface of a body?"
             raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
         linear = self.now.linear
         motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
@@ -392,9 +392,9 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with pairs found at u, and the connected parts (parts,) in which gaps change by `DEPTH`.
+        """Return the contact with pairs found at u, and in which connected parts (parts,) gaps change by over `DEPTH`.
 
-        Pairs that are open before and after the update are ignored.
+        Pairs that are open before and after the update are ignored, as are parts after `FOLLOWS` updates.
         """
         found = self.found(at)
         law = self.now.law
@@ -486,7 +486,7 @@ class ContactProblem(Loads):
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Return the flagged rows of two pairs or states as one, in some order."""
+    """Return the rows of two pairs or states that `kept` flags, as one object, sorted by the indices `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

@@ -168,7 +168,7 @@ class Convex:
             try:
                 assert len(self._planes)
             except QhullError:
-                what = f"Convex: corners = {line(self.corners)}: lie in one line or plane"
+                what = f"Convex: corners = {line(self.corners)} lie in one line or plane"
         if what:
             raise ValueError(
                 f"{what}, must be 3 or more places (x, y), not on a line, or 4 or more (x, y, z), not in a plane"

@@ -220,7 +220,7 @@ class Tool:
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the unit vector (d,) of the load; zero without a load direction."""
+        """Return the unit vector (d,) along `direction`; zero if no direction is given."""
         if self.direction is None:
             return np.zeros(dim)
         along = unit_vector("Tool: direction", self.direction)
@@ -263,7 +263,7 @@ class Tool:
         """Raise an error for an invalid rotation of a free tool."""
         of, rotates = self._uniform(dim), self.rotates(dim)
         if dim == 3 and rotates:
-            raise ValueError(f"Tool: moment = {self.moment:g}, must be left out: in 3D tools do not rotate")
+            raise ValueError(f"Tool: moment = {self.moment:g}, must be left out, because in 3D tools do not rotate")
         if self.spin and not rotates:
             raise ValueError(f"Tool: spin = {self.spin:g}, must be 0 for a tool that does not rotate")
         if not rotates:
@@ -281,7 +281,7 @@ class Tool:
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at t (s); by_forces: motion due to forces, m; for a free tool (d,) and the rotation, rad."""
+        """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), with rotation, rad."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")

@@ -49,7 +49,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements, m, of k tools due to loads, at start and end of a step; with free tools (k, q), with rotations."""
+    """Displacements (k,), m, of k tools due to loads in a step; if any tool is free, (k, q) with rotations, rad."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -178,7 +178,7 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements due to loads before a step, m: (tools,), with free tools (tools, q) with rotations."""
+        """Return displacements due to loads before a step (tools,), m; if a tool is free, (tools, q) with rotations."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
@@ -241,7 +241,7 @@ class Tools(Touching):
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which positions facing a tool lie within half a cell of the tool's edge, where the body continues.
+        """Return which positions facing a tool lie within half a cell of the tool's edge, if the body continues there.
 
         The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
         than a cell keeps its whole contact.
@@ -307,7 +307,7 @@ class Tools(Touching):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains touch tools at time t (s), and follow the Q1 field alone.
+        """Return which corners (n, 2^d, d) of domains touch tools at time t (s): they must follow the Q1 field.
 
         The tool would reverse any other motion of these corners in the next step, and pressures would oscillate.
         """
@@ -323,8 +323,8 @@ class Tools(Touching):
 
         Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
 
-        corners (n, 2^d, d): corners of the domains, m; t: time, s; free (n, 2^d, d): components that no other condition
-        prescribes; most: (largest penetration that is corrected) / cell size.
+        corners (n, 2^d, d): corners of the domains, m; t: time, s; free (n, 2^d, d): whether no other condition
+        prescribes a component; most: (largest penetration that is corrected) / cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:

@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell and its bodies if domains overlap in it; return the function for the next check."""
+    """Warn about the fullest cell and its bodies if domains overlap; return the next check, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -108,7 +108,7 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return for owned cells (n,) the lost volume of the softest material, m^d, the contrast, and one of its pieces.
+    """Return for owned cells (n,): lost volume of the softest material, m^d, modulus ratio, and one of its pieces.
 
     With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
     cell gives 1 / sum s M instead.  The loss is the difference of both, divided by the largest 1/M.  The loss is at

@@ -28,7 +28,7 @@ def check_held(
     active
         Cells of this process that contain a cut subdomain.
     free : (nodes, d)
-        Displacement components that no wall fixes.
+        Whether no wall fixes a displacement component.
     holds
         Constraints by prescribed displacements, tools and contact: cells (m,), lexicographic cells of the other part
         (m,) or None, positions (m, d), m, and directions (m, d).  A constrained part constrains the other part.
@@ -63,7 +63,7 @@ def check_held(
     if grid.axisymmetric:  # rings have one rigid-body mode, along the axis
         modes = [direction[:, 1]]
     R = np.array(modes).T
-    reached, missing = np.arange(count + 1) == 0, np.full(count, len(modes))  # entry 0: the ground
+    reached, missing = np.arange(count + 1) == 0, np.full(count, len(modes))  # index 0: the ground
     while True:
         on = reached[against]
         grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]

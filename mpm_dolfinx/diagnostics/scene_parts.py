@@ -64,8 +64,8 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
     hole = near[~touches[row + 1]]
     if len(hole):  # nodes of the first cells lie on the axis, and are fixed
         k = hole[inner[hole].argmin()]
-        what = "a hole of radius %.3g m about the axis, at %s, is narrower than a cell of %.3g m: its side moves like "
-        what += "that of a solid core; use smaller cells, or a grid that begins at a radius > 0"
+        what = "a hole of radius %.3g m about the axis, at %s, is narrower than a cell of %.3g m, so that its side "
+        what += "moves like a solid core; use smaller cells, or a grid that begins at a radius > 0"
         warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), h)
 
 

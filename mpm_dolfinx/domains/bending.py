@@ -29,8 +29,8 @@ def followed(
     """Return two fields (2, n, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     cells (n,): owned cells that contain the corners; x (n, d), m: positions of the corners; u (nodes, d), m: nodal
-    displacements; filled (cells,): whether local cells contain material.  Nodes beyond empty cells are not used: they
-    may be of another body.
+    displacements; filled (cells,): whether local cells contain material.  Nodes beyond empty cells are not used,
+    because they may be of another body.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
@@ -49,7 +49,7 @@ def followed(
 
 
 def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return nodal values (nodes, d) at nodes (n, k), as an array (d, k, n)."""
+    """Return the values (d, k, n) of a nodal field u (nodes, d) at `nodes` (n, k)."""
     return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
 
 

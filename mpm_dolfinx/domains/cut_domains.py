@@ -43,8 +43,8 @@ class Patches:
         Index of the face in `faces`, and index of the material point.
     cell : (n,)
         Lexicographic index of the cell.
-    x, xi : (n, d), m, -
-        Position at the last cut, and local coordinates in the domain.
+    x, xi : (n, d)
+        Position at the last cut, m, and local coordinates in the domain.
     share : (n,)
         Fraction of the face that the point represents.
     """
@@ -67,7 +67,7 @@ class Patches:
         """Origin of positions (d,), m, see `Grid`."""
         around = grid.around(interpolate(faces.domain[face], xi)) if grid.axisymmetric else 1.0
         if renewed is not None:
-            around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are those of rings
+            around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are already areas of rings
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
 
@@ -131,14 +131,14 @@ class CutDomains(Keyed):
         self.cells, self.x = grid.local(exchange.send(self.pieces.cell)), exchange.send(self.pieces.x)
         """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
         self.mixed = exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
-        """In 3D: mean products of the offsets of the pieces, see `Pieces`."""
+        """In 3D: mean products of the offsets in each piece from its centroid, see `Pieces`."""
         self.second = exchange.send(self.pieces.second) if second else None
-        """If `second`: mean products of all offsets of the pieces (m, d, d), m^2."""
+        """If `second`: mean products (m, d, d), m^2, of all offsets in each piece from its centroid."""
         self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return the largest motion of corners since the cut / cell size, for each connected part (count,).
+        """Return for each connected part (count,) the largest motion of corners since the cut / cell size.
 
         `part` (n,) is the index of the part to which each point belongs.
         """
@@ -157,7 +157,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the volumes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections."""
+        """Return sizes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections in the plane."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -223,7 +223,7 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 field u (nodes, d) at the material points (n, d); only for a cut without `domains`."""
+        """Return values (n, d) of a Q1 field u (nodes, d) at the material points; only for a cut without `domains`."""
         exchange, cells, x = self._followed
         return exchange.back(self.grid.at(cells, x, u))
 
@@ -258,11 +258,11 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic indices (m,) of the cells of x (m, d), m; x are in or on domains of points (m,)."""
+        """Return the lexicographic index (m,) of the cell of each x (m, d), m, in or on the domain of point `at`."""
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) of positions in domains; if a domain has no piece there, its largest piece's cell."""
+        """Return the cell (m,) of each x; if the domain has no piece in this cell, the cell of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

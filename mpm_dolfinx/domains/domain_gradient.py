@@ -93,7 +93,7 @@ def cell_ratios(
 
     With mean dilatation, the ratio of a cell is the current volume of its domains, computed from the corners, divided
     by the reference volume.  This ratio does not depend on the path of deformation.  Differences between the ratios of
-    domains in a cell do no work: no force would oppose a drift of ratios that are only updated by increments.  Without
+    domains in a cell do no work, so no force would oppose a drift of ratios updated by increments only.  Without
     mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
     volumes are meaningless near plastic flow.
 

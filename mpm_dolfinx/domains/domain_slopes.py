@@ -48,7 +48,7 @@ class Neighbours:
         for i, body in enumerate(bodies):
             chosen_rows = (of == i).nonzero()[0]
             corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
-            # the key of a face is the same in both domains: its lowest corner index, and that of the opposite corner
+            # the key of a face is the same in both domains: lowest corner index, and index of the opposite corner
             first = corners.argmin(axis=2)[:, :, None]
             ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
             key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
@@ -62,7 +62,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face's index: columns, face centres, m, and existence of the neighbours at this face.
+        """Return a function of a face index.  It returns the neighbours' data (c, k) and face centres, and which exist.
 
         `own` (c, k) are c data columns of the k points.  `faces` are, for each face index, the face centres (d, k), m.
         """

@@ -31,9 +31,8 @@ def fitted_at(
     The fit uses points of the same body and material, weighted by the distance in the reference configuration.  Results
     in removed domains are meaningless.
 
-    sizes: number of points of each body of the scene; id (m,): identifiers of the points; xi (m, d): local coordinates
-    in their domains; both are the same on all processes.  tensor: function from material points to their tensors (n, k,
-    k).
+    sizes: number of points of each body of the scene; id (m,), xi (m, d): identifiers of the points, and local
+    coordinates in their domains, the same on all processes; tensor: function from material points to tensors (n, k, k).
     """
     m = len(id)
     d = xi.shape[1]

@@ -8,9 +8,9 @@ overfill.  After a step the corners of yielded domains therefore move by the d t
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 
-with the volumes V_p of points and V of their domains, the mean over their corners, and the edges h of cells.  Both sums
-are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together; corners of elastic
-domains and held corners stay.  Kugelstadt et al. (2019) so correct densities of cells (implicit density projection).
+with the volumes V_p of a point and V of its domain, the mean over the corners of the domain, and the edges h of cells.
+Both sums are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of
+elastic domains and held corners stay.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Domains(NamedTuple):
     corners: NDArray[np.float64]  # corners (n, 2^d, d), m
     volume: NDArray[np.float64]  # volumes of the points (n,), m^d, > 0; in axisymmetry of their rings, m^3
     yielded: NDArray[np.bool_]  # whether to correct the domain (n,)
-    free: NDArray[np.bool_]  # components of corners (n, 2^d, d) that may move
+    free: NDArray[np.bool_]  # which displacement components of corners (n, 2^d, d) may change
     body: NDArray[np.int64]  # index of the body (n,)
     number: NDArray[np.int64]  # indices of corners in the seeded body (n, 2^d), >= 0; -1 for renewed domains
 
@@ -82,9 +82,9 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
 def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return indices (n, 2^d) of corners x (n, 2^d, d), m, of bodies (n,); corners that coincide have the same index.
+    """Return an index (n, 2^d) for each corner x (n, 2^d, d), m, of domains; corners that coincide have the same index.
 
-    Corners of a body coincide if they have the same seeded index `number` (n, 2^d), or lie within `tolerance`, m.
+    Corners of one `body` (n,) coincide if their seeded index `number` is equal, or if they lie within `tolerance`, m.
     """
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:

@@ -5,7 +5,7 @@ A displacement wave of the corners with a wavelength of two domains does not mov
 resists it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
 The filter damps them when the grid is reset.  For each axis a in turn,
 
-    d <- d - D_a^T s / 64 D_a d,
+    d <- d - D_a^T s / 64 D_a d.
 
 The result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
 positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different
@@ -49,9 +49,9 @@ MARGIN = len(THIRD) - 1
 class Lattice:
     """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
 
-    start: identifier of the body's first point; given: pairs of faces on which a condition prescribes displacements,
-    and the prescribed axes; contacts: pairs of domains (m,) that touch other bodies, and the corners (m, 4) of the
-    touching faces.
+    start: identifier of the body's first point; given: for each condition, the faces on which it prescribes
+    displacements, and the prescribed axes; contacts: for faces that touch other bodies, the
+    index (m,) of the domain, and the indices (m, 4) of the corners of the face in this domain.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Lattice:
         return ((points.id >= self._start) & (points.id < self._stop)).nonzero()[0]
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which components (m, 2^d, d) of the corners of domains are prescribed."""
+        """Return which displacement components (m, 2^d, d) of the corners of domains are prescribed."""
         return self.held_of(ids)[0]
 
     def held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -131,8 +131,8 @@ def _change(
 
     The lattice is distributed over the processes in slabs along its first axis.
 
-    shape: number of lattice sites along each axis; number (m,): lexicographic number of the site of each row of values.
-    values (m, k + 1): values, and the number of crossed cells.  tolerance (k + 1,): largest difference between rows of
+    shape: number of lattice sites along each axis; number (m,): lexicographic index of the site of each row of values;
+    values (m, k + 1): k values, and the number of crossed cells; tolerance (k + 1,): largest difference between rows of
     a site; if it is exceeded, the domains have separated, and the site is left out.  thirds (4, n - 3) along each axis:
     weights of third differences of n corners, for domains of different widths, see `_divided`.
     """
@@ -214,7 +214,7 @@ def _along(
 def lattices(
     bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
 ) -> list[Lattice]:
-    """Return the lattices of the active bodies.  `given` are prescribed faces, each with the prescribed components."""
+    """Return the lattices of the active bodies.  `given`: faces with prescribed displacements, and their axes."""
     start = np.cumsum([0, *map(len, bodies)])
     around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
     out = []
@@ -226,7 +226,7 @@ def lattices(
 
 
 def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.bool_]:
-    """Return which components (n, 2^d, d) of corners conditions prescribe."""
+    """Return which displacement components (n, 2^d, d) of the corners of domains are prescribed."""
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -235,7 +235,7 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices (n, 2^d) of corners in their bodies, -1 for renewed domains, and which touch other bodies."""
+    """Return indices (n, 2^d) of corners in bodies, -1 for renewed domains, and which corners touch other bodies."""
     numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)

@@ -48,7 +48,7 @@ class PiecePressures:
     slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for pieces that stay
     bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for pieces that stay
     of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; None for pieces to be moved
-    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None to be moved
+    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None like `of_cell`
 
     def __post_init__(self):
         for rows in self.arrays.values():
@@ -141,9 +141,9 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return differences and slopes to neighbours and drained sides, and which neighbours and drained sides exist.
+        """Return pressure differences, Pa, and slopes, Pa/m, to neighbours or drained sides, and where these exist.
 
-        All have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
+        All four arrays have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
         """
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
@@ -162,7 +162,7 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy also at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of two: that of the next cell inside, and the linear
+        In a cell at a no-flow side, the slope is the smaller of the slope in the next cell inside, and the linear
         extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
         stay between the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
 
@@ -203,7 +203,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return for each cell the largest factor (n,) <= 1 that keeps its increments (m,) within [`low`, `high`] (n,)."""
+    """Return for each cell the largest factor (n,) <= 1 that keeps increments in the cell within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -216,7 +216,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, of the new pieces, or mass potentials (additive) if `old` contains these."""
+    """Return the pressures (m,), Pa, of the new pieces, or the mass potentials if `old` contains mass potentials."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -232,7 +232,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     left_fraction = old.fraction.copy()
     left_fraction[before] -= common[match]
     share = common / new.fraction
-    # rows are pressure and centroid; the centroid of a piece is relative to that of its domain
+    # rows are pressure and centroid; centroids of pieces are relative to the centroid of the domain
     sums, d = sum_by(owner, old.fraction * np.concatenate([old.slope, old.x], axis=1).T, n), old.x.shape[1]
     slope, centre = sums[:d], sums[d:]
     then = np.concatenate([old.pressure[None], old.x.T - centre[:, owner]])
@@ -249,7 +249,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor (m,) that keeps corrected pressures within the bounds, equal for all pieces of a domain."""
+    """Return the factor (m,) of corrections that keeps pressures within bounds, equal for all pieces of a domain."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)

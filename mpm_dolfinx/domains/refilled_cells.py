@@ -70,7 +70,7 @@ class New(NamedTuple):
     """New particle domains; arrays over n domains."""
 
     corners: NDArray[np.float64]  # (n, 4, 2), m
-    group: NDArray[np.int64]  # index of the group (n,); its domains receive values from the same pieces
+    group: NDArray[np.int64]  # index of the group (n,); domains of a group receive values from the same pieces
     parent: NDArray[np.int64]  # key of the seeded face for each face, or -1 (n, 4)
     area: NDArray[np.float64]  # seeded area of each face (n, 4), m^(d-1), in axisymmetry of the ring
     ends: NDArray[np.float64]  # reference positions of the ends of each face (n, 4, 2, 2), m
@@ -94,8 +94,8 @@ class RefilledCells:
     """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
     body (n,): index of each point's body; flowed (n,): whether points may be renewed; needs (n,): whether their domains
-    need renewal; faces: surface of the bodies; signs: the conditions on these faces, see `Renewal._signatures`; second:
-    whether to compute second moments of the pieces.
+    need renewal; faces: surface of the bodies; signs: keys of these faces, and the index of the set of
+    conditions on each face, see `Renewal._signatures`; second: whether to compute second moments of the pieces.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class RefilledCells:
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
         self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
-        """Cells to renew."""
+        """Which cells are renewed."""
         self.affected = self._at(self.chosen)
         """Whether each point (n,) loses its domain or a part of it."""
 
@@ -168,7 +168,7 @@ class RefilledCells:
     def _chosen(
         self, needed: NDArray[np.bool_], excluded: NDArray[np.bool_], small: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the cells to renew: cells of `needed` points (n,), and cells with `small` remaining parts."""
+        """Return which cells to renew: cells of `needed` points, and cells where `small` parts would remain."""
         of, cell = self.pieces.point, self.cell
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[needed[of]]] = True
@@ -247,7 +247,7 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the index of each of these cells among the renewed cells, which is the group of its new domains."""
+        """Return for each cell the group of its new domains, which is the index of the cell among the renewed cells."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
@@ -294,8 +294,8 @@ class RefilledCells:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the keys (n,) of edges in cells (n,), and the reference positions (n, 2, 2), m, of the edges' ends.
 
-        The key is that of the surface part nearest to the middle of the edge.  Reference positions of the ends come
-        from the parts nearest to the ends.
+        The key of an edge is the key of the surface part nearest to the middle of the edge.  Reference positions of
+        the ends come from the parts nearest to the ends.
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
@@ -315,7 +315,7 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the seeded areas (n,), m^(d-1), of parts of faces, from and to coordinates t (n, 2) on the faces."""
+        """Return the seeded areas (n,), m^(d-1), of the parts of faces between two coordinates t (n, 2) on each."""
         share = np.ptp(t, axis=1)
         if self.grid.axisymmetric:
             corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
@@ -339,7 +339,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains in cells (n,); faces on a cell's side join the surface where it runs along this side."""
+        """Return new domains in cells (n,).  Faces on a cell's side join the surface where it runs along this side."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -431,7 +431,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return slopes (n, 2, k), 1/m, of point values (points, k) in new domains: fits to the pieces in the cells."""
+        """Return slopes (n, 2, k), 1/m, in new domains: least-squares fits to point values (points, k) in the cells."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -488,7 +488,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return the values (n, ...) in new domains of point data on faces: means over the old surface in the cell."""
+        """Return point data (n, ...) of new domains on the surface: means over the old surface in the same cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -505,7 +505,7 @@ class RefilledCells:
 
 
 def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return keys, lengths and ends of faces for n domains without faces on the surface."""
+    """Return keys, seeded areas and ends of faces for n domains without faces on the surface."""
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 
@@ -516,9 +516,9 @@ def _ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains (n, 4, 2) into convex polygons; return these, with the face index of each edge, and their domains.
+    """Divide domains (n, 4, 2) into convex polygons; return these, and the index of the domain of each polygon.
 
-    `volume` (n,) are the areas of the domains' cells, m^2.
+    The polygons have the face index of each edge.  `volume` (n,), m^2: area of the cell of each domain.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))

@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of point data for each face: key of the seeded face, or -1; seeded area, m^(d-1); reference ends, m."""
+"""Names of data of a point's faces: key of the seeded face, or -1; seeded area, m^(d-1); ends in the reference, m."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -25,7 +25,7 @@ def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points; if they lack the data of renewed faces, add these data with the values for no such faces."""
+    """Return the points with the data of renewed faces.  Points that lack these data have no renewed faces."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -40,13 +40,13 @@ class RenewedFaces:
     row: NDArray[np.int64]  # index of the seeded face among the faces of all surfaces (m,)
     at: NDArray[np.int64]  # index of the point (m,)
     face: NDArray[np.int64]  # index of the face in its domain (m,)
-    xi: NDArray[np.float64]  # local coordinates of the ends of the face's part in the surface (m, 2, 2)
+    xi: NDArray[np.float64]  # local coordinates (m, 2, 2) of the ends of the part that is in the surface
     area: NDArray[np.float64]  # seeded area (m,), m^(d-1), in axisymmetry of the ring, m^2, see `AREA`
     ends: NDArray[np.float64]  # reference positions of the ends (m, 2, 2), m, see `ENDS`
-    old: NDArray[np.bool_] | None = None  # if rows are positions: whether each lies on a seeded face (n,)
+    old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each position (n,), from the face's index among renewed faces; negative if seeded."""
+        """Return the face of each position; `number` (n,) is its index among the renewed faces, negative if seeded."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -59,13 +59,13 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of parts and whole faces, and face indices (n,), with new values at renewed faces."""
+        """Return areas of face parts and of whole faces, and face indices (n,), replaced at renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
 
     def reference(self, X: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2), m, at local coordinates xi (n, 2); on seeded faces X (n, 2), m."""
+        """Return the reference positions (n, 2), m, at local coordinates xi (n, 2); they are X on seeded faces."""
         along = xi[np.arange(len(xi)), 1 - self.face // 2]
         share = (1 + along[:, None]) / 2
         new = self.ends[:, 0] + share * (self.ends[:, 1] - self.ends[:, 0])

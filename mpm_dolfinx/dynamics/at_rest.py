@@ -27,9 +27,9 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return for each side at rest point ids (m,) and tractions (m, d), Pa, that replace its reactions.
+    """Return for each side at rest the ids (m,) of its points, and tractions (m, d), Pa, that replace its reactions.
 
-    Tractions are forces per reference area, computed from the stresses.  On a part of the bodies, resultants and
+    Tractions are forces per reference area, computed from the stresses.  On a connected part, resultants and
     moments of tractions and of reactions may differ.  Rigid-body fields of tractions remove this difference.
 
     Parameters
@@ -37,13 +37,13 @@ def balancing_tractions(
     cut, points
         Cut particle domains, and material points.
     stresses, surfaces
-        Total stresses (faces, k, k), Pa, on sides by name, and the sides.
+        Total stresses (faces, k, k), Pa, on the sides, and the sides; both by name of the side.
     parts
         Connected parts of the bodies.
     forces : (nodes, d), N
         Reactions of the sides at the owned nodes of this process, zero at other nodes.
     held : (nodes, d)
-        Components that remain fixed.
+        Which displacement components remain fixed.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))

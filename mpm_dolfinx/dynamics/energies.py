@@ -32,7 +32,7 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 def initial_energies(
     materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, from which `after` counts, see `Result.energies`; `internal` is the work of the stresses.
+    """Return the energies, J, at the start, see `Result.energies`.  `internal` is the work of the stresses.
 
     kinetic: kinetic energy of free tools, J; renews: whether domains may be renewed.
     """
@@ -65,7 +65,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies, J, after renewal of particle domains, from those before; `renewal` is the loss."""
+    """Return the energies, J, after renewal of domains; `renewal` is all kinetic and elastic energy lost by renewal."""
     if not renewed:
         return energy
     now = stored(materials, new)

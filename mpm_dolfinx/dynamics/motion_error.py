@@ -24,9 +24,9 @@ def motion_error(
     this difference for unresolved modes, as in Hosea and Shampine (1996).  The estimate is ERROR times this difference.
     The error of a resolved mode of angular frequency omega in a step dt is 0.081 omega dt times this difference.
 
-    solvers, mass: of the last substep; K: its momentum tangent; flights: states of motion after the two substeps;
-    seconds, own: time weights in the last substep, s, of the rate in the first substep (`seconds`) and in the last
-    (`own`).
+    solvers, K, mass: linear solvers, momentum tangent and mass of the last substep; flights: states of motion after the
+    two substeps; seconds, own: time weights, s, which the last substep gives to the rate in the first substep
+    (`seconds`) and to the rate in the last substep (`own`).
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

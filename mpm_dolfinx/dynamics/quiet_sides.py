@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Quiet boundaries with the traction t = t_0 - Z (v - 2 v_in) and the impedance Z = rho c_p n n + rho c_s (I - n n).
 
-t_0 is the constant traction at rest, v the velocity of the side, and v_in that of an incoming wave.  n is the normal,
-rho the density; c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969; incoming waves:
-Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
+t_0 is the constant traction at rest, v the velocity of the side, and v_in the velocity of an incoming wave.  n is the
+normal, rho the density; c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969; incoming
+waves: Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Points on quiet sides, with tangential impedance, normal minus tangential impedance, kg/m^2/s, and traction at
-    rest.
+    """Forms at points on quiet sides.  Fields are the tangential and the normal minus the tangential impedance,
+    kg/m^2/s, and the constant traction, Pa: the traction at rest plus the traction of incoming waves.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of particle domains with inertia: masses with the old centres, and velocities with the old momenta."""
+"""Renewal of particle domains with inertia: masses that keep centres of mass, velocities that keep momenta."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def velocities(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return velocities and their gradients in new domains: means of the old affine fields over the overlap, corrected.
 
-    The correction is a rigid motion of each group (n,), which restores its momentum and angular momentum.
+    The correction is a rigid motion of each group of domains; it restores momentum and angular momentum of the group.
 
-    corners (n, 4, 2), x (n, 2), m: of the new domains; masses, kg: of the old and of the new points.
+    corners (n, 4, 2), x (n, 2), m, group (n,): of each new domain; masses, kg: masses of the old and new points.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -79,8 +79,8 @@ def velocities(
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
     """Return masses (n,) of new domains at x (n, 2), m, shifted within each cell so that the old centre of mass stays.
 
-    group (n,): group of each new domain; old (points,): masses of the old domains.  A mass at most halves; then the
-    centre moves.  Domains outside the renewed cells are parts of one old domain, so their masses stay.
+    group (n,): group of each new domain; old (points,): masses of the old domains.  A mass changes by at most half;
+    if this limit applies, the centre moves.  Outside the renewed cells a group is of one domain, and its masses stay.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)
@@ -99,13 +99,13 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of removed domains, their groups, and their masses (m,), from those of the points."""
+    """Return the pieces of removed domains, their groups, and their masses (m,), from the masses of the points."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]
 
 
 def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Return the mass (count,) of each group (m,), and the mean (count, k) of values (m, k), weighted by mass (m,)."""
+    """Return the mass (count,) of each group, and the mean (count, k) of values (m, k) in it, weighted by mass."""
     whole = np.bincount(group, mass, count)
     columns = [np.bincount(group, mass * column, count) for column in values.T]
     return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]

@@ -165,18 +165,18 @@ class BorderFaces:
     """Faces between cells of different soil, with their conductivities; arrays over m faces."""
 
     borders: Borders
-    mobility: Mobility  # of the filled owned cells
+    mobility: Mobility  # mobility of the filled owned cells
     laws: Any  # relative conductivities, see `Laws`
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     area: NDArray[np.float64]  # (m,), m^(d-1)
-    paths: list[Paths]  # flow paths on both sides, see `through`
-    lengths: list[NDArray[np.float64]]  # lengths of these paths (m,), m
+    paths: list[Paths]  # flow paths from the cells on both sides to the faces, see `through`
+    lengths: list[NDArray[np.float64]]  # lengths of the flow paths (m,), m
     offsets: list[NDArray[np.float64]]  # vectors along paths (m, d), m, for the pressure drops by weight
     weight: NDArray[np.float64]  # unit weight of the fluid (d,), N/m^3
     bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at cell pressures p (2, m), Pa.  `force` (c, d), N/m^3, is the inertia force in cells."""
+        """Return fluxes at pressures p (2, m), Pa, on both sides.  `force` (c, d), N/m^3: inertia force in cells."""
         weight = (
             self.weight
             if force is None

@@ -88,7 +88,7 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow, run-off and ponds before the first step: zero, or no entries without rain."""
+        """Return zero volumes of outflow, run-off and ponds before the first step; an empty dictionary without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
@@ -188,8 +188,8 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
 
-        Conductivities change by decades in a step, so the correction must be proportional to the flux.  Limits prevent
-        that the correction empties the soil.
+        Conductivities change by decades in a step, so the correction must be proportional to the flux.  Limits keep
+        the correction from emptying the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -204,7 +204,7 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r of the faces (m,), and the derivative of k_r times the difference of mass potentials."""
+        """Return k_r of the faces (m,), and the derivative of k_r (p - outside + drop) by the cell pressure p (m,)."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
@@ -272,9 +272,9 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides with pressure and water supply of ponds in a time dt, s; and the capacities of ponds, m^d.
+        """Return the sides with the pressure of ponds, and their supply in a time dt, s; and capacities of ponds, m^d.
 
-        `ponds` are the largest depths, m.
+        `ponds` are the largest depths of the ponds, m.
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
@@ -351,7 +351,7 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow through the sides of each condition, and the rain on these sides, (2,), m^d/s."""
+        """Return for each condition two rates (2,), m^d/s: the outflow through its sides, and the rain on them."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

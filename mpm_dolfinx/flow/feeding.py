@@ -68,7 +68,7 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of the cells.  They are stored until either changes."""
+        """Return data that depend on conductivities and motion of the cells.  They are kept until either changes."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Start a substep.  `difference` (m,), Pa, corrects cell pressures at `sides`, see `nonorthogonal`."""

@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
-ALONG = 0.1  # least component of a side's unit normal along an axis, with which the side determines the slope along it
+ALONG = 0.1  # a side determines the slope along an axis if its unit normal has a larger component along this axis
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Mobility:
     """Mobility of the n filled owned cells.  In unsaturated soil, `mean` and `share` refer to saturated pores."""
 
     mean: NDArray[np.float64]  # mean over the pieces (n,), m^2/(Pa s)
-    share: NDArray[np.float64] | None = None  # (mobility along each axis) / mean (n, d); None without mixed cells
+    share: NDArray[np.float64] | None = None  # (mobility along each axis) / mean (n, d); None if all are 1
     # vector from the centroid to the pressure position of the cell (n, d), m; None without mixed cells
     shift: NDArray[np.float64] | None = None
     # fractions of the mean that come from soil without a retention curve, and from soil of each curve (n, k)
@@ -52,7 +52,7 @@ class CellMotion(NamedTuple):
     """Motion of n cells in a step."""
 
     F: NDArray[np.float64]  # deformation gradient (n, d, d)
-    cofactors: NDArray[np.float64]  # of F (n, d, d)
+    cofactors: NDArray[np.float64]  # cofactor matrix of F (n, d, d)
     ratio: NDArray[np.float64]  # determinant of F (n,)
     moved: NDArray[np.float64]  # displacement (n, d), m
     hoop: NDArray[np.float64] | None  # circumferential stretch (n,); None unless axisymmetric
@@ -154,7 +154,7 @@ class OpenSides:
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pressure differences, Pa, and slopes, Pa/m, to drained sides (n, d, 2, 2), by axis and end of a cell.
 
-        The values are nan where there is no drained side.
+        The last index is 0 for the difference, 1 for the slope.  Both are nan where there is no drained side.
 
         at (m,): index of the cell of each face among the filled cells; p (n,), Pa: pressures of the filled cells.
         """
@@ -172,7 +172,7 @@ class OpenSides:
         slots = (ends * at[:, None] + np.arange(ends)).ravel()
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            """Return the sums of values for each cell, axis and end."""
+            """Return the sum of the values at each cell, axis and end."""
             return sum_by(slots, values.ravel(), ends * len(p)).reshape(out.shape[:3])
 
         whole = total(share)
@@ -188,7 +188,7 @@ class PieceContents:
 
     cells: NDArray[np.int32]  # owned cell (m,)
     weight: NDArray[np.float64]  # volume (m,), m^d
-    area: NDArray[np.float64]  # volume (m,), m^d; in axisymmetry area of the section, m^2
+    area: NDArray[np.float64]  # volume (m,), m^d; in axisymmetry the area of the section, m^2
     x: NDArray[np.float64]  # centroid (m, d), m; in axisymmetry of the section
     faces: NDArray[np.float64]  # areas on the lower and upper faces of the cell (m, d, 2), m^(d-1)
     fixed_stress: NDArray[np.float64]  # fixed-stress coefficient beta (m,), 1/Pa
@@ -209,12 +209,12 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, m^d; and in axisymmetry areas (m,) of their sections, m^2."""
+        """Volumes (m,) of the pieces, m^d; and the same again, in axisymmetry areas of sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells, m^d; and the fixed-stress coefficient times the volume."""
+        """Volumes (n,) of the material in filled cells, m^d; and mean fixed-stress coefficients times these volumes."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions of material in the filled cells (n,)."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
@@ -240,7 +240,7 @@ class CellContents(Keyed):
         return sum_by(self._at, values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest softness of the pieces (m,) in each filled cell."""
+        """Return the largest softness (n,) of the pieces in each filled cell, at least 1."""
         softest = np.ones(len(self.filled))
         np.maximum.at(softest, self._at, softness)
         return softest
@@ -259,7 +259,7 @@ class CellContents(Keyed):
         return values
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means (n,) over the pieces (m,) of each filled cell, weighted by volume."""
+        """Return the means (n,), weighted by volume, of values (m,) of the pieces in each filled cell."""
         return self.total(self.weight * values) / self.volume
 
     def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -267,7 +267,7 @@ class CellContents(Keyed):
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at centroids, for nodal displacements, m; cells `rests` do not move."""
+        """Return the motion of filled cells at centroids, from displacements `nodal`, m; cells `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()

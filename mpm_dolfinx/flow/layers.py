@@ -44,11 +44,11 @@ PAIRS = 2**16
 class Lines:
     """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a piece that it crosses."""
 
-    line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid it runs
+    line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece
     length: NDArray[np.float64]  # length in the crossed piece / cell size
     before: NDArray[np.float64]  # fraction of the piece's resistance below the position of mean pressure
-    total: NDArray[np.float64]  # length of the whole line / cell size
+    total: NDArray[np.float64]  # length of the whole line in the cell / cell size
 
 
 class MixedCells:
@@ -97,9 +97,9 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis: lines through pieces `rows`, the piece that each crosses, and a weight, < 1 on borders.
+        """Return for each axis pairs of a line through a piece of `rows` and a piece that it crosses, and weights.
 
-        `first` and `count` (m,) are the index of the first piece and the number of pieces in the cell of each piece.
+        Weights are < 1 on borders.  `first`, `count` (m,): first piece, and number of pieces, in each piece's cell.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -227,7 +227,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the part (n,) of the factor of each cell's shift that is caused by inclined layers."""
+        """Return for each cell (n,) the part due to inclined layers of the factor by which shifts are multiplied."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -248,9 +248,9 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return (mobility along each axis) / mean (n, d), for a mobility that varies gradually in a cell.
 
-    Pieces conduct in series along the mobility's gradient, and in parallel across it.  For other directions, the
-    arithmetic minus the harmonic mean is distributed over the axes, by the variance of a linear variation along each
-    axis.
+    Pieces conduct in series along the mobility's gradient, and in parallel across it.  For other directions of the
+    gradient, the arithmetic minus the harmonic mean is distributed over the axes, in proportion to the variance that a
+    linear variation along each axis explains.
 
     offset, kappa: positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa
     s); mean: mean mobility of the filled cells (n,).

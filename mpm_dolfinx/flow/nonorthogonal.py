@@ -52,7 +52,7 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 
 
 class Gradients:
-    """Gradients of the head in cells that need the non-orthogonal correction: centroids offset along a face or side.
+    """Pressure gradients minus unit weight in cells that need the correction: centroids offset along a face or side.
 
     The object is valid for one cut.  contents: material in the cells; sides: open sides of the bodies.
     """
@@ -106,7 +106,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gradients (n, 2 d, d) and (m, d), 1/m, for a unit difference to one neighbour or to one side."""
+        """Gradients, 1/m, for a unit difference to one neighbour (n, 2 d, d), and to one side (m, d)."""
         known, d = self._known, self._separation.shape[2]
         at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
@@ -187,7 +187,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether the condition's faces in its cell are not opposite the centroid on average."""
+    """Return for each face (m,) whether the faces of its condition in its cell are on average off the centroid."""
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))

@@ -30,8 +30,8 @@ def second_differences(
 ) -> PETSc.Mat:
     """Return the matrix H.  The pattern depends on the active cells only.
 
-    unknowns: pressure unknowns of the active cells; grid: background grid; strength (n, d), m^d/Pa: for each owned
-    active cell and axis: the coefficient, >= 0, of a damping of jumps with the same effect on alternating pressures;
+    unknowns: pressure unknowns of the active cells; grid: background grid; strength (n, d), m^d/Pa, for each owned
+    active cell and axis: coefficient, >= 0, of a damping of jumps with the same effect on alternating pressures;
     centroid (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells; opening
     (c, d, 2): open fractions of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
     """

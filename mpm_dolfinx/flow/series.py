@@ -7,8 +7,8 @@ eliminates them.  Each soil conducts like a pair of cells that contain only this
 layers of exponential soil is therefore exact at any offset from the grid.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over the
-mean of its fractions of the replaced lines.
+cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over
+its mean fraction of the replaced lines.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Paths(NamedTuple):
     resistance: NDArray[np.float64]  # length / (mobility x fraction of lines) (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths at an index of all arrays."""
+        """Return the paths for an index that applies to all arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
@@ -83,7 +83,7 @@ class _Links(NamedTuple):
     low: NDArray[np.int64]  # first node
     high: NDArray[np.int64]  # second node
     law: NDArray[np.int64]  # index of the retention curve
-    conductance: NDArray[np.float64]  # at k_r = 1, m/(Pa s)
+    conductance: NDArray[np.float64]  # conductance at k_r = 1, m/(Pa s)
     drop: NDArray[np.float64]  # hydrostatic pressure drop, Pa
 
 
@@ -91,8 +91,8 @@ class _Flows(NamedTuple):
     """Flows through the segments."""
 
     k: NDArray[np.float64]  # conductance, m/(Pa s)
-    own: NDArray[np.float64]  # derivative of the flux by the pressure of the first node
-    other: NDArray[np.float64]  # minus the derivative by the pressure of the second node
+    own: NDArray[np.float64]  # derivative of the flux by the pressure of the first node, m/(Pa s)
+    other: NDArray[np.float64]  # minus the derivative of the flux by the pressure of the second node, m/(Pa s)
     flux: NDArray[np.float64]  # flux from the first to the second node, m/s
     rounding: NDArray[np.float64]  # rounding error of the flux, m/s
 
@@ -149,7 +149,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return conductances and derivatives of the flux (3, m) between both ends."""
+        """Return (3, m): conductance between both ends, and derivatives of the flux by the pressures at both ends."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)
@@ -192,7 +192,7 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of the segments in series (m, nodes - 1)."""
+        """Return the values (m, nodes - 1) of the segments in series, from the values of all segments."""
         starts = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
@@ -218,7 +218,7 @@ class _Chain:
         return x, balanced
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
-        """Return conductances and flux derivatives (3, m) between both ends, from all segments of a face."""
+        """Return the result of `solved` (3, m), from the flows through all segments of a face."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
@@ -233,7 +233,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return conductance and flux derivatives (3, m) of two segments in series.  `first` may be None."""
+    """Return conductance and flux derivatives (3, m) of two segments in series; of one if `first` is None."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

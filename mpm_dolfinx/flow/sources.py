@@ -44,7 +44,7 @@ class Sources(Feeding):
         for source in sources:
             gain = form("sources", source, points=pieces, q=q, p=p, t=t)
             if len(gain.arguments()) != 1:
-                raise ValueError(f"sources: {line(source)}: does not depend on q, must be linear in it")
+                raise ValueError(f"sources: {line(source)} does not depend on q, must be linear in q")
             if p in gain.coefficients():
                 self._slopes.append(PointForm(ufl.derivative(gain, p, one), pieces))
             with compiling(f"sources: {line(source)}", "linear in q"):
@@ -52,7 +52,7 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the inflow rates into the filled cells at p, m^d/s, as a local array."""
+        """Return the inflow into each filled cell at p, m^d/s, as a local array."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:

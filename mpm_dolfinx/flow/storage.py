@@ -19,7 +19,7 @@ The sum over all cells is the bodies' balance.  `fluid_content` defines the chan
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
 other cells, and pressure jumps are damped (see below).  Points carry the difference, a volume defect (`owed`).  The
-next steps correct fractions of it (`defect`), at a constant rate over the step.
+next steps correct fractions of this defect (`defect`), at a constant rate over the step.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
@@ -178,7 +178,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two values (n,) of filled cells: storage due to saturation, m^d/Pa; integral of S d(chi p)/dp, m^d."""
+        """Return for filled cells (n,) the storage due to saturation, m^d/Pa, and integrals of S d(chi p)/dp, m^d."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -271,7 +271,7 @@ class StorageSystem:
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
-        """Return forms over the faces between cells of the same soil, see `Relative`: fluxes by p; see `gravity`."""
+        """Return two forms over the faces between cells of the same soil: the matrix of the fluxes, and `gravity`."""
         fluxes, facets = self._forms.fluxes, self._facets
         facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
@@ -321,7 +321,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the flux matrix between cells; of unsaturated soil at p.  `force`: see `StorageForms.driven`."""
+        """Assemble the flux matrix between cells (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -335,11 +335,11 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Residual of the fluid balance of each cell, m^d, and its scales in each connected part (parts,), m^d."""
+    """Residual of the fluid balance of each cell, m^d, and sums over each connected part (parts,), m^d."""
 
     vector: PETSc.Vec
     exchanged: NDArray[np.float64]  # sum of absolute changes of content and of sources
-    round_off: NDArray[np.float64]  # bound of rounding errors
+    round_off: NDArray[np.float64]  # sum of the bounds of rounding errors
     off: NDArray[np.float64]  # sum of absolute mass errors of the cells
     gain: NDArray[np.float64]  # change of content plus outflow minus sources
     rates: Rates  # at (u, p)
@@ -485,7 +485,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content due to pressure errors (n,), Pa, and the content's changes in the step."""
+        """Return errors of the water content due to pressure errors (n,), Pa, and changes of content in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -512,7 +512,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Relative accuracy of linear solves.  Dry cells store little fluid, so errors there must be small."""
+        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so errors there must be small."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(

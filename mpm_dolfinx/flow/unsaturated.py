@@ -41,7 +41,7 @@ UFL = Functions(ufl.ln, ufl.exp, ufl.tanh, ufl.conditional, ufl.lt, ufl.max_valu
 class Between(NamedTuple):
     """Relative conductivity k_r between the two sides of a face."""
 
-    k: Any  # the value
+    k: Any  # value of k_r
     slopes: tuple[Any, Any]  # derivatives by the pressures on both sides, 1/Pa
 
 
@@ -96,7 +96,7 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """Relative conductivities as functions of pressure, by index of the retention curve; index 0 is saturated soil."""
+    """Relative conductivities as functions of pressure, by index of the retention curve; 0: soil without a curve."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]
@@ -106,7 +106,7 @@ class Laws:
     def between(
         self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], drop: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) of laws (m,) between pressures on both sides (m,), Pa, and slopes (2, m), see `fitted`."""
+        """Return k_r (m,) of curves `law` (m,) between two pressures (m,), Pa, and derivatives (2, m), see `fitted`."""
         k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
         for number, one in enumerate(self.conductances, 1):
             rows = np.flatnonzero(law == number)
@@ -130,7 +130,7 @@ class Relative:
     Attributes
     ----------
     shares
-        DG0: fractions of a cell's mobility at k_r = 1: of soil without a retention curve, and of soil with each curve.
+        DG0: fractions of a cell's mobility at k_r = 1 due to soil without a retention curve, and to soil of each curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -169,7 +169,7 @@ class Relative:
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
     def uniform(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets between active cells of the same soil."""
+        """Return the facets with the same soil on both sides, among the `facets` between active cells."""
         faces = self._borders.value
         return facets if faces is None else faces.borders.uniform
 

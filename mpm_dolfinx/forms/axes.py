@@ -24,7 +24,7 @@ def planar(F) -> bool:
 
 
 def embedded(F, across=1):
-    """Return a deformation gradient as (3, 3).  In plane strain `across` is the out-of-plane stretch."""
+    """Return a deformation gradient as a UFL tensor (3, 3).  In plane strain `across` is the out-of-plane stretch."""
     if F.ufl_shape == (3, 3):
         return F
     return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, across]])

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices of Q1 vectors.  Sums over the points of each cell precede insertion.
-
-Inserting a matrix for every point would cost more than computing it.
-"""
+"""Nodal forces and element matrices of Q1 vectors.  Sums over the points of each cell precede insertion."""
 
 from __future__ import annotations
 
@@ -82,7 +79,7 @@ def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArra
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return rows and columns of the stored entries of a matrix, and each matrix entry's index among these."""
+    """Return row and column of each stored entry of a matrix, and the index of each matrix entry among these."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -186,7 +183,7 @@ class StackedElementMatrices:
 
     Run time per point for Hencky's law and 20 points per cell: 4.2 us, of which the kernel takes 2.3, the products 1.4,
     and the insertion 0.4.  If 24 x 24 entries were inserted for each point, the time would be 13.8 us.  With the 300
-    sums of `ElementMatrices` the time would be 4.8 us, and the kernel would compile in 13 s; that of this class
+    sums of `ElementMatrices` the time would be 4.8 us, and the kernel would compile in 13 s.  The kernel of this class
     compiles in 7 s.  If the points in each octant of a cell are merged (8 points), Newton's method does not converge
     for a bending beam.
 
@@ -241,7 +238,7 @@ class StackedElementMatrices:
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
     """Return batches of cells with similar numbers of points: cells (c,), points (c, most), padding (c, most).
 
-    Cells are indices into `Places.filled`.  Padding is True for entries after the last point of a cell.
+    Cells and points are indices in `Places.filled` and in `Places.cells`.  Padding is True after a cell's last point.
     """
     cells = places.cells
     filled = places.filled

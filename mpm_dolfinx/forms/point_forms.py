@@ -35,7 +35,7 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Number of points in a batch of element matrices that fits into the cache, and in one call of an expression.
+"""Number of points in a batch of element matrices, which fits into the cache; and in one call of an expression.
 
 A call for few points uses the smaller number, because a bound kernel is called for all of its cells.
 """
@@ -167,9 +167,9 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None: zero, for points.
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None for points (zero).
     hoop : (n, 4)
-        In axisymmetry: moments of the pieces in the plane, see `Pieces`; None: moments of points.
+        In axisymmetry: moments of the pieces in the plane, see `Pieces`; None for points.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Unrolled local dofs (n,) of Q1 vectors in all cells with points; index of each cell's dofs in these."""
+        """Unrolled local dofs (n,) of Q1 vectors in all cells with points; index of the dofs of each cell in these."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
@@ -398,7 +398,7 @@ class PointForm:
         self._rows, self._bound = Rows(self.compiled, points), Latest()
 
     def _parts(self, data: PointData) -> list[tuple]:
-        """Return each chunk of points, and the form bound to their cells."""
+        """Return all chunks of points, each with the form bound to the cells of these points."""
         cells, bind = data.places.slots if self._dense else data.cells, self.compiled.bind
         return self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))])
 

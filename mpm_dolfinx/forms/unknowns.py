@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The unknowns of a step: their numbering, vectors and matrices.
 
-Functions are defined on the whole grid.  Vectors, matrices and factors contain only the free degrees of freedom of
-active nodes or cells.  In the local-to-global map all other degrees of freedom have the index -1, which PETSc ignores.
-dolfinx can therefore assemble directly into these vectors and matrices.
+Functions are defined on the whole grid.  Vectors, matrices and factorisations contain only the free degrees of freedom
+of active nodes or cells.  In the local-to-global map all other degrees of freedom have the index -1, which PETSc
+ignores.  dolfinx can therefore assemble directly into these vectors and matrices.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
     function: any function of the space; its ghosts are used.  dofs: unrolled local degrees of freedom that are
-    unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  With None, the
-    space computes all positions at each request.
+    unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  If x is None,
+    the space computes all positions at each request.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
@@ -60,7 +60,7 @@ class Unknowns:
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Position of each entry of a vector (n, d), m."""
+        """Position (n, d), m, of the node or cell of each entry of a vector."""
         x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
         return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 class Velocity:
     """Velocity (u - past) / own at the end of a substep.  For backward Euler past = 0, and own is the step length.
 
-    u: displacement increment of the step, m; own, s: time weight of the substep's rate; past, m: part of u that is due
-    to the rate of the previous substep.
+    u: displacement increment of the step, m; own, s: time weight of the rate in the substep; past, m: part of u that
+    is due to the rate of the previous substep.
     """
 
     def __init__(self, u: fem.Function):

@@ -23,7 +23,7 @@ PLACES = ("t", "x")
 
 
 def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
-    """Raise an error for an object that lines cannot follow, and for a grid without lines."""
+    """Raise ValueError for an object that lines cannot follow, and for a grid without lines."""
     if hasattr(follow, "pose"):
         if lines is not None and all(map(equal, checked(lines))):
             raise ValueError(f"grid: follow = {line(follow)}: all cells are equal, must be smaller around the tool")
@@ -32,7 +32,7 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
     else:
         raise ValueError(f"grid: follow = {line(follow)}, must be a Tool, or a function of t, x or both")
     if lines is None:
-        raise ValueError("grid: follow without lines, must be given with lines; their numbers stay constant")
+        raise ValueError("grid: follow without lines, must be given with lines; the number of lines stays constant")
 
 
 def lines_at(
@@ -40,8 +40,8 @@ def lines_at(
 ) -> list[NDArray[np.float64]]:
     """Return the lines (n,), m, along each axis, from a function of time t (s) and positions x (n, d), m.
 
-    `given` are the lines with which the grid was created.  Along each axis, the new lines must have the same number,
-    and the same first and last coordinate.
+    `given` are the lines with which the grid was created.  Along each axis, the number of lines, the first and
+    the last coordinate must not change.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -58,7 +58,7 @@ def lines_at(
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return lines (n,), m, along each axis after the smallest cells have moved by a displacement `shift` (d,), m.
+    """Return lines (n,), m, along each axis, after a displacement `shift` (d,), m, of the smallest cells.
 
     Edge lengths between the smallest cells and a side are multiplied by powers 1, 2 ... of a common factor, counted
     from the smallest cells.  Cells therefore still grow with the distance from the smallest ones, but faster or slower.
@@ -92,12 +92,12 @@ def _filled(width: NDArray[np.float64], length: float, more: float, least: float
     """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):
-        raise ValueError(f"{what}, but the small cells begin at a side: lines must have larger cells on both sides")
+        raise ValueError(f"{what}, but the small cells begin at a side; lines must have larger cells on both sides")
     power = np.arange(1, len(width) + 1)
     total = length + more
     if total < len(width) * least * (1 - SAME):
         allowed = f"must be at least {len(width) * least:.3g} m for the {len(width)} cells between them"
-        raise ValueError(f"{what}: the small cells are {total:.3g} m from a side, {allowed}")
+        raise ValueError(f"{what}, which leaves {total:.3g} m between the small cells and a side, {allowed}")
 
     def beyond(factor: float) -> float:
         return float((width * factor**power).sum() - total)

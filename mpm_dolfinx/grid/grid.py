@@ -46,7 +46,7 @@ MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the ends (2^d, d) of the corners of a box along each axis: 0 lower, 1 upper."""
+    """Return at which end of each axis each corner of a box lies (2^d, d): 0 lower, 1 upper."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
@@ -77,7 +77,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) by index (n,), as floats (`np.bincount` may return ints)."""
+    """Return the sums (..., size) of values (..., n) of equal index (n,), as floats (`np.bincount` may return ints)."""
     shape = values.shape[:-1]
     if shape:
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
@@ -105,7 +105,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return, for each integer in m ranges given by `first` and `count` (m,): its range (n,), and the integer (n,)."""
+    """Return the range (n,) and the value (n,) of each integer in m ranges from `first` on, of `count` integers."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -155,7 +155,7 @@ class Cells:
     signs : (2^d, d)
         Directions from the midpoint of a cell to its nodes.
     at
-        Current positions.
+        Current positions of nodes and cells.
     cell_number
         Lexicographic index of each local cell.
     locals, owners
@@ -618,14 +618,14 @@ class Grid:
         return self.local(cell), x, values
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes and the index of the copy (n, d + 1) of local nodes (n,)."""
+        """Return for local nodes (n,) the indices along the axes and, in column d, the index of the copy."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices along the axes and the index of the copy (n, d + 1) of local cells (n,)."""
+        """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
@@ -640,7 +640,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which x (from the base) are outside the grid by more than `tolerance` cell sizes plus rounding."""
+        """Return which x, from the base, are outside the grid by more than `tolerance` cell sizes plus rounding."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
@@ -722,8 +722,8 @@ class GridOfGroups(Grid):
     The mesh consists of disconnected boxes at the same position.  The same process owns corresponding cells of all
     copies.
 
-    grid: grid of the bodies; group (points,): group of each material point of the scene, in the order of ids, counted
-    from 0.
+    grid: grid of the bodies; group (points,): index, from 0, of the group of each material point of the scene, in the
+    order of ids.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):

@@ -17,12 +17,12 @@ MOST = 2**31 - 1
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the largest rounding error, m, of coordinates as large as x."""
+    """Return the largest rounding error, m, of coordinates with the magnitudes of x, m."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
 def checked(lines: Sequence[ArrayLike]) -> list[NDArray[np.float64]]:
-    """Return the grid lines (n,), m, along two or three axes; raise ValueError if they are invalid."""
+    """Return the grid lines (n,), m, along each of two or three axes; raise ValueError if they are invalid."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
         raise ValueError(f"grid: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
     out = []

@@ -29,7 +29,7 @@ def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Distribute a box of cells among `count` ranks from rank `first` on.  Arrays are views of the whole grid's arrays.
+    """Distribute a box of cells among `count` ranks from `first` on.  Arrays are views of the arrays of the whole grid.
 
     If there are enough cells, each rank gets at least one; this has priority over equal loads.
     """
@@ -60,7 +60,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the list of ranks that hold the cells, for each cell the owner first; and each cell's start in this list.
+    """Return the ranks that hold each cell, the owner first, in one list; and the start of each cell in this list.
 
     Processes that own a neighbour across a face hold the cell as a ghost.
 

@@ -246,7 +246,7 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return the stored results of the current conditions; a condition that is new keeps its current results.
+    """Return the stored results of the current conditions; a condition without stored results keeps its current ones.
 
     Raise ValueError if shapes differ, or if the motion of a tool is not finite.
     """
@@ -306,7 +306,7 @@ def _nodes(grid: Grid) -> NDArray[np.int64]:
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return, on rank 0, indices and values of all nodes with non-zero values; an empty dictionary for None."""
+    """Return, on rank 0, indices and values of nodes with non-zero values; an empty dictionary if `nodal` is None."""
     if nodal is None:
         return {}
     nodal = nodal.reshape(-1, grid.dim)
@@ -365,9 +365,9 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
         if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
-            raise ValueError(f"pieces: {name}: {rows.dtype} of shape {rows.shape}, or not finite")
+            raise ValueError(f"pieces/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
     if not np.array_equal(np.unique(arrays["id"]), ids) or (np.diff(arrays["id"]) < 0).any():
-        raise ValueError("pieces: id: points differ from the points of the bodies")
+        raise ValueError("pieces/id: points differ from the points of the bodies")
 
 
 def _without_rows(state: State) -> State:

@@ -330,7 +330,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Context manager that turns errors while a file is read into a ValueError: no `Writer` wrote the file."""
+    """Context manager for reading a file: errors become a ValueError that no `Writer` wrote the file."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
@@ -346,8 +346,8 @@ def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, An
 class Series:
     """A time series for ParaView: an index (.pvd), and files in a folder with the same name.
 
-    `entries` are the times so far with their files, the same on every process.  `next` is the path of the next file,
-    without suffix.
+    `entries` are the output times so far with their files, equal on all processes.  `next` is the path of the next
+    file, without suffix.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
@@ -388,7 +388,7 @@ class Series:
 class Table:
     """A table in a CSV file, to which rows are added.  The first column is the time.
 
-    Columns whose names begin with one of `own` belong to conditions, and may change from stage to stage.
+    Columns whose names begin with one of the texts `own` belong to conditions, and may change from stage to stage.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):

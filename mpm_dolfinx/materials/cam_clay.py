@@ -132,7 +132,7 @@ class ModifiedCamClay(Skeleton):
         if self.bulk is None or getattr(self.bulk, "follows", False):  # derived for another material before `replace`
             object.__setattr__(self, "bulk", bulk)
         elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=SAME)):
-            raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out: it is P_0 / kappa")
+            raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out; it is P_0 / kappa")
 
     @property
     def nearly_incompressible(self) -> bool:

@@ -40,9 +40,9 @@ class LawAtPoints:
     shapes
         Shape of each parameter and state variable of the law.
     stretches
-        Size of the law's deformation gradients, 2 or 3; by default that of the grid.
+        Number of rows of the law's deformation gradients, 2 or 3; by default `grid.stretches`.
     cell_size
-        Cell size passed to the law, m; by default the mean cell size of the grid.
+        Cell size passed to the law, m; by default the mean edge length of the cell that contains the point.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return form data at the points with indices `rows`; values (n, ...): F, parameters, state of all points."""
+        """Return form data at the points with indices `rows`; values: F, parameters, state (n, ...) of all points."""
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return names and values (n, ...) of the state at the end of a step of dt, s; `data` contain F at the end."""
+        """Return name and values (n, ...) of each updated state variable; data: with F after a step of dt, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -189,7 +189,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws, time and cell size, as UFL constants; the caller sets the time.
+    """Return the arguments `BY_SCENE` of laws, time and cell size, as UFL; the caller sets the time.
 
     points: integration points of the law; on a grid of several cell sizes each of them stores the size of its cell.
     """
@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of a cell; in uneven grids, the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell, in uneven grids of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -250,9 +250,9 @@ class SoftnessAtPoints:
         self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
-        """Return the softness (n,), in [1, MOST], of points with F, parameters and state.
+        """Return the softness (n,), in [1, MOST], of the points `at`, data with F, parameters and state.
 
-        dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): last softness.
+        dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): old softness.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -275,7 +275,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
+        Integration points of the pieces; with any law they have the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

@@ -127,7 +127,7 @@ class SceneMaterials:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
         self.check_cells()
         self.shapes: dict[str, tuple[int, ...]] = {}
-        """Shape of each parameter and variable of state."""
+        """Shape of each parameter and of each state variable."""
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
             count = sum(len(body) for body in bodies if body.material == i)
@@ -181,7 +181,7 @@ class SceneMaterials:
         given = (law.residual is not None) + (law.solution is not None)
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
-            raise ValueError(f"{law.__name__}: has {has}, must have one of the two with unknowns, none without")
+            raise ValueError(f"{law.__name__}: has {has}, must have one of the two if it has unknowns, else none")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
             raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
@@ -230,23 +230,23 @@ class SceneMaterials:
         return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index of each point's part (n,), see `parts`."""
+        """Return the index (n,) of the part that contains each point, see `parts`."""
         return self._part[points.material]
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index in `laws` of each point's law (n,)."""
+        """Return the index (n,) in `laws` of the law of each point."""
         return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) Q1 cells would lock."""
+        """Return for each point (n,) whether Q1 cells would lock."""
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) laws use the out-of-plane stretch given by the mean dilatation."""
+        """Return for each point (n,) whether its law uses the out-of-plane stretch given by the mean dilatation."""
         return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) laws accept an out-of-plane stretch."""
+        """Return for each point (n,) whether its law accepts an out-of-plane stretch."""
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -265,13 +265,13 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index 1, 2, ... of each point's retention curve (n,); 0 if the pores stay saturated."""
+        """Return the index (n,), from 1, of the retention curve of each point; 0 if the pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return S, dS/dp, 1/Pa, chi and k_r at pressures p (m,), Pa, of the points with indices `of`, or of all."""
+        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (m,), Pa; of (m,): indices of points, by default all."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -286,7 +286,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return S, dS/dp, 1/Pa, chi and k_r at pressures p (m,), Pa; rows (m, width): field `retention` of points."""
+        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (m,), Pa; rows (m, width): field `retention` there."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -306,8 +306,8 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Evaluate the function `value(material, *columns)` at the points and return the results (n, ...).
 
-        `columns` are further point data (n,), passed to the function.  The function returns one value per point, or one
-        number; for a uniform material without columns also one value (...).
+        `columns` are further point data (n,), passed to the function.  The function returns values (n, ...) or one
+        number.  Without `columns`, for a uniform material, it may also return one value (...) for all points.
         """
         each, shapes = [], set()
         for i in self._used:
@@ -351,7 +351,7 @@ class SceneMaterials:
         return _expanded(self.materials[i], values, len(rows))
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return all parameters at the points (n, ...); zero if a point's law does not have them."""
+        """Return each parameter at the points (n, ...), zero where the law of a point does not have it."""
         out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
         for i in self._used:
             rows = (points.material == i).nonzero()[0]
@@ -398,7 +398,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return an array (n, 2): specific yield of the points, and suction, Pa, at which it has drained."""
+        """Return an array (n, 2): specific yield of the points, and suction, Pa, at which drainable pores are empty."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -430,11 +430,11 @@ class SceneMaterials:
         return modulus + np.minimum(fluid, most * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the state at the points (n, ...)."""
+        """Return each state variable at the points (n, ...)."""
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) a state variable has changed from its initial value by more than `EVOLVED`."""
+        """Return for each point (n,) whether a state variable, except suction, has changed by more than `EVOLVED`."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = (law_of == number).nonzero()[0]
@@ -452,7 +452,7 @@ class SceneMaterials:
         return any(not law.state for law in self.laws)
 
     def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which points (n,) have a law without state variables, which is therefore elastic."""
+        """Return for each point (n,) whether its law has no state variables, and is therefore elastic."""
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -468,7 +468,7 @@ class SceneMaterials:
         return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
 
     def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) soil has yielded with dilatant flow."""
+        """Return for each point (n,) whether its soil has yielded with dilatant flow."""
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -544,7 +544,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return every law with the indices of its points, and their data for forms."""
+        """Return for every law: the law, the indices of its points, and the form data of these points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]

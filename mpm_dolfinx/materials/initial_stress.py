@@ -25,7 +25,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress: end of Newton's method, largest allowed value
+EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress: to end Newton's method, and to accept a result
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -60,7 +60,7 @@ class K0:
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the ratio or surcharge at positions x (n, d), m: one value or (n,)."""
+        """Return the ratio or surcharge at positions x (n, d), m: one value, or an array (n,)."""
         value = getattr(self, name)
         given = at_places(f"K0: {name}", "one value per position", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
@@ -127,7 +127,7 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 class InitialStresses:
     """Initial stresses of the bodies of a scene.
 
-    bodies: all bodies; given: see `by_body`; pressure: initial pore pressure, Pa, a number or a function of position.
+    bodies: all bodies; given: result of `by_body`; pressure: initial pore pressure, Pa, a number or a function of x.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
@@ -166,7 +166,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress (n, 3, 3), Pa, of points of a body; above: see `_above`."""
+        """Return the effective stress (n, 3, 3), Pa, of points of a body; above: results of `_above` there."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -197,7 +197,7 @@ class InitialStresses:
             raise ValueError(f"initial_stress: K0 with gravity = {g}, must point down along the last axis at the start")
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
-            raise ValueError("initial_stress: K0 without gravity at the start or surcharge, must have one of them")
+            raise ValueError("initial_stress: K0 has neither gravity at the start nor surcharge, must have one of them")
         # the densities of all points on all processes
         seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.present_density(seeded)
@@ -246,7 +246,7 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method: ln `seeded_stretch`, or half of ln C_p^-1."""
+    """Elastic strains for target stresses, by Newton's method.  A strain is ln `seeded_stretch` or ln(C_p^-1) / 2."""
 
     materials: SceneMaterials
     points: MaterialPoints  # n points
@@ -261,7 +261,7 @@ class _ElasticStrains:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Which components (n, k) are unknown."""
+        """Whether each strain component (n, k) is unknown."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
         out[:, 2] &= self.materials.knows_across(self.points)
         return out
@@ -315,7 +315,7 @@ class _ElasticStrains:
         return np.clip(strain - change, -1, 1)
 
     def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return the points with elastic strains, and which points (n,) do not reach their target stress."""
+        """Return the points with elastic strains, and for each point (n,) whether it misses its target stress."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains
@@ -335,7 +335,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return the points at their positions, with the elastic strains of `moved`, the same points after deformation."""
+    """Return points at their old positions, with the elastic strains of `moved`, the same points after deformation."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
@@ -393,7 +393,7 @@ def _outside_yield(materials: SceneMaterials, points: MaterialPoints, target: ND
     if np.isfinite(friction):
         ratio = np.tan(np.radians(45 + friction / 2)) ** 2
         allowed += (
-            f": without cohesion, friction = {friction:.4g} degrees allows K0 from {1 / ratio:.3g} to {ratio:.3g}"
+            f" (without cohesion, friction = {friction:.4g} degrees allows K0 from {1 / ratio:.3g} to {ratio:.3g})"
         )
     stress = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(target[i]))
     where = points.x[i] + materials.grid.base

@@ -270,12 +270,12 @@ class _Equations:
         Raises
         ------
         ValueError
-            The result is no dict of pairs with names and shapes of the unknowns, or a derivative has an unknown name.
+            The result is no dict of pairs with names and shapes of the unknowns, or a derivative is by no trial value.
         """
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
-                allowed = "must be a pair: values, and a dict of derivatives"
+                allowed = "must be a pair of values and a dict of derivatives"
                 raise ValueError(f"{self._title}: {of} = {line(pair)}, {allowed}")
         if set(found) != set(self._unknowns):
             names = (", ".join(map(str, of)) or "nothing" for of in (found, self._unknowns))
@@ -325,9 +325,9 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return the failed points.
+    """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return indices of failed points.
 
-    system: function of indices (r,) and values (r, m).  It sets the values, and returns f, df/dy and norms of f (r,).
+    system: function of point indices (r,) and their y (r, m); it stores these y, and returns f, df/dy and norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

@@ -48,7 +48,7 @@ class MohrCoulomb(Frictional):
     cohesion
         Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
-        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default that of the apex, c cot phi.
+        Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default the apex stress c cot phi.
 
     Other parameters: see `Skeleton`, all by name.  State variable in `points.data`: `plastic`, the inverse plastic
     metric C_p^-1 (3, 3).
@@ -129,9 +129,9 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives (n, 3, 3), and 1 in plastic flow, else 0 (n,).
+    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives by e (n, 3, 3), and flags (n,) of plastic flow.
 
-    e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,).
+    e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,) of the law.
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
@@ -191,7 +191,7 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the valid final stresses (n, 3), Pa, their derivatives (n, 3, 3), and their violations (n,)."""
+        """Return final stresses (n, 3), Pa, derivatives by trial stresses, and violations (n,); few: candidates."""
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:
@@ -212,7 +212,7 @@ class _Return:
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the final stresses on a face, or on the edge of two faces, their derivatives, and their violation."""
+        """Return final stresses on a face, or on the edge of two faces, with their derivatives and their violations."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops

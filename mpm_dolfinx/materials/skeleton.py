@@ -207,7 +207,7 @@ class Skeleton:
                 values[name] = given = numbers(f"{what}(X)", given, None, allowed="numbers", test=np.isreal)
                 if given.shape[:1] != (len(X),) or (name in scalars and given.ndim > 1):
                     more = "" if name in scalars else " ..."
-                    allowed = f"one value a position, ({len(X)},{more})"
+                    allowed = f"({len(X)},{more}), one value for each position"
                     raise ValueError(f"{what}(X) has shape {given.shape}, must be {allowed}")
             elif name in scalars and np.ndim(value):
                 raise ValueError(f"{what} has shape {np.shape(value)}, must be a number or a function of X")
@@ -219,7 +219,7 @@ class Skeleton:
         return self.kirchhoff is None
 
     def check_cells(self, cell_size: float) -> None:
-        """Raise ValueError if cells are too large for a softening law; cell_size: m."""
+        """Raise ValueError if cells are too large for a softening law; cell_size: edge length of a cell, m."""
 
     @classmethod
     def first_piola(cls, F, values: Mapping[str, object]):
@@ -272,7 +272,7 @@ class Skeleton:
 
     @property
     def nearly_incompressible(self) -> bool:
-        """Whether Q1 cells would lock; they then use the mean dilatation of each cell (`dilatation`)."""
+        """Whether Q1 cells would lock; they then use the mean dilatation of each cell (`mean_dilatation`)."""
         return self.poisson > LOCKING
 
     @property

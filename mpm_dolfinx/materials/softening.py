@@ -72,7 +72,7 @@ class SofteningDruckerPrager(DruckerPrager):
         least = np.max(np.asarray(self.xi * (self.cohesion - self.residual) * cell_size / stiff))
         if least >= np.min(self.slip):
             what = f"{type(self).__name__}: slip = {np.min(self.slip):g}, must be > {least:.3g} m in cells of"
-            raise ValueError(f"{what} {cell_size:g} m: the soil would soften faster than it unloads")
+            raise ValueError(f"{what} {cell_size:g} m, else the soil softens faster than it unloads")
 
     @staticmethod
     def kirchhoff(

@@ -69,7 +69,7 @@ def components(b, plane: bool):
 
 
 def symmetric(values):
-    """Return the symmetric UFL tensor (3, 3) with six components."""
+    """Return the symmetric UFL tensor (3, 3) with the six components `values`, in the order of `SPACE`."""
     place = {}
     for k, (i, j) in enumerate(SPACE):
         place[i, j] = place[j, i] = values[k]
@@ -119,13 +119,13 @@ class Coaxial:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Components (n, 6)."""
+        """Components (n, 6) of the coaxial tensors."""
         out = np.zeros((len(self._x), len(SPACE)))  # in the plane the other components are zero
         out[:, : len(self._inner)] = (self._outer @ self._y[:, :, None])[:, :, 0]
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return derivatives (n, 6, 4 or 6) with respect to the given tensors' components; slopes (n, 3, 3): dy/dx.
+        """Return derivatives (n, 6, 4 or 6) of `values` by components of the given tensors; slopes (n, 3, 3): dy/dx.
 
         In principal axes, off the diagonal, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij.  For x_i = x_j the limit is
         (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.

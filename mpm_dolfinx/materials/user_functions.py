@@ -160,7 +160,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
     if out.arguments():
         return out, False
     if unknown not in out.coefficients():
-        raise ValueError(f"terms: {line(out)}: depends on neither u nor v, must be a form in one of them")
+        raise ValueError(f"terms: {line(out)} depends on neither u nor v, must be a form in one of them")
     return ufl.derivative(out, unknown, test), True
 
 

@@ -20,11 +20,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums of the pieces of one part for `OfSuction`; None if there are none.
+    """Return the sums over the pieces of one part in each cell that `OfSuction` needs; None if it needs none.
 
     points: integration points of the pieces; locks: whether their law uses the mean dilatation; F: deformation gradient
-    (d, d), a UFL variable; slopes: UFL derivatives with respect to the pressure, Pa: of the first Piola-Kirchhoff
-    stress (d, d) and, with mean dilatation, of the stress pi conjugate to theta.  Empty if the law is independent of
+    (d, d), a UFL variable; slopes: derivatives by the pressure, as UFL, of the first Piola-Kirchhoff stress (d, d) and,
+    with mean dilatation, of the mean stress pi conjugate to theta.  `slopes` are empty if the law is independent of
     suction.
     """
     share = 1 / ufl.det(points.F)
@@ -37,8 +37,8 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of the nodal forces with respect to the cells' pressures, for laws that depend on suction.
 
-    dim: number of axes; dilatation: mean dilatation of cells, None if no cell would lock; sums: for each part, see
-    `SceneMaterials.parts`, the result of `suction_sums`.
+    dim: number of axes; dilatation: mean dilatation of cells, None if no cell would lock; sums: results of
+    `suction_sums`, one for each part of the points (`SceneMaterials.parts`).
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):
@@ -48,7 +48,7 @@ class OfSuction:
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return pairs of cells (c,), and derivatives (c, n), m^(d-1), of nodal forces by these cells' pressures."""
+        """Return pairs: cells (c,), and derivatives (c, n), m^(d-1), of their n nodal forces by their pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

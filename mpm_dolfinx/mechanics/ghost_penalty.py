@@ -42,7 +42,7 @@ RATIO = 0.3
 result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""With integration at points: strength of the penalty; all faces of cells with a volume fraction below FULL have it."""
+"""With integration at points: strength of the penalty, and volume fraction below which all faces of a cell have it."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
@@ -115,8 +115,8 @@ class GhostPenalty:
     ) -> NDArray[np.int64]:
         """Set the volume fractions and moduli of the cells `own` (n,), owned cells that contain material.
 
-        Return all active local cells, ascending.  volume (n,): of the material in each cell, m^d; moduli (n,): products
-        of `modulus` and of `shear` with this volume.
+        Return all active local cells, ascending.  volume (n,), m^d: volume of the material in each cell; moduli: two
+        arrays (n,), first `modulus` times this volume, then `shear` times this volume.
         `fill` must be zero before the call.
         """
         grid, fill = self.grid, self.fill.x.array
@@ -132,7 +132,7 @@ class GhostPenalty:
         return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
-        """Return the penalty on faces of this process; at_walls: faces of cells with nodes on walls of the grid."""
+        """Return the penalty on faces of this process; at_walls: the faces whose cells have nodes that walls fix."""
         return GhostLoads(self.form.on(facets), self.form.on(at_walls))
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides, by penalties on the mean in each cell and weaker ones at points; see `held_cells`.
+"""Prescribed displacements of sides, by penalties on cell means and weaker penalties at points; see `held_cells`.
 
 If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
 multipliers (Hestenes 1969).  With multipliers the means are exact, whatever the resistance of the body.
@@ -35,7 +35,7 @@ from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
-ARTEFACT = "%s: not at its prescribed position at %s: %s"
+ARTEFACT = "%s: not at its prescribed position at %s, so %s"
 
 
 class HoldForms:
@@ -115,7 +115,7 @@ class GivenDisplacements(Acting):
             sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
             jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
             if jump:
-                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move: %s"
+                what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move; %s"
                 why = "values count from the start or the last reset_displacement, must begin at the present position"
                 self._warn(number, what, jump, place.start, why)
 
@@ -235,15 +235,15 @@ class GivenDisplacements(Acting):
             share = over_all(self._grid.comm, float(share), MPI.MAX)
             if -np.inf < share < 0.5:  # less than half of the increment
                 what = f"{line(hold)}: the bodies follow at most {max(0.0, share):.0%} of the prescribed increment"
-                raise CannotFollow(f"{what}, must be free to move: undrained pores keep their water")
+                raise CannotFollow(f"{what}, must be free to move; undrained pores keep their water")
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of the particle domains `ids`; domains at a held side become prisms.
+        """Return corners (m, 2^d, d), m, of the particle domains `ids`, after domains at a held side become prisms.
 
-        tracked: corners, m; volume (m,): volumes, in axisymmetry areas in the plane.  A prism has the given volume, and
-        the tracked corners on the held face: if the face moved, the penalty would pull it back at once.
+        tracked, m: tracked corners; volume (m,): domain volumes, in axisymmetry areas of their sections.  A prism
+        has this volume, and the tracked corners on the held face.  If the face moved, the penalty would pull it back.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
@@ -300,7 +300,7 @@ class HoldLoads(Loads):
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
         self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
-        self._lacked = np.full(1, np.inf)  # for sides of each part: what `augment` has found, infinite at first
+        self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
 
     def augment(self, at: At) -> bool:
         """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
@@ -326,7 +326,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return which components (m,) have reached their positions at u: they lag by less than 1 / sqrt(HOLD)."""
+        """Return whether each component (m,) lags at u by at most 1 / sqrt(HOLD) of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:

@@ -48,7 +48,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; this and the next three: at the last grid reset
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; down to `undrained`: at the last grid reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     firm: NDArray[np.float64]  # (n,) confined modulus times area, N, of which the part of the fluid is limited
@@ -57,7 +57,7 @@ class HeldPoints(NamedTuple):
     gap: NDArray[np.float64]  # (n, d) prescribed minus present position, m
     given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
     normal: NDArray[np.float64]  # (n, d) area vector at the last reset of the grid, m^(d-1)
-    force: NDArray[np.float64]  # (n, d) present force, rotated with the side, N
+    force: NDArray[np.float64]  # (n, d) force of the present stress, rotated with the side, N
 
 
 def inner_cells(
@@ -68,7 +68,7 @@ def inner_cells(
     cell: NDArray[np.int32],
     normal: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return the local cells (n,) whose constraints contain the points of sides.
+    """Return for each point of the sides the local cell (n,) whose constraint contains this point.
 
     After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
     beyond the line.  Constraints there would contradict the constraints of inner cells: only a large motion of nodes
@@ -111,10 +111,11 @@ class HeldCells:
         Position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3, of each penalty.
         For a penalty on a mean, the values are means over its points.
     stiffness
-        Stiffness of each penalty and component, N/m.  Normal to a side parallel to the grid: from the confined modulus.
+        Stiffness of each penalty and component, N/m.  The stiffness on a mean, normal to a side parallel to the grid,
+        follows from the confined modulus.
     limit : (2, k, d)
-        Largest plausible force of each penalty on a mean, N: of the skeleton, and of undrained soil at its prescribed
-        position.  Larger forces are artefacts.
+        Largest plausible force of each of k penalties on means, N: for the skeleton, and for undrained soil if the side
+        is at its prescribed position.  Larger forces are artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -177,7 +178,7 @@ class HeldCells:
         extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
         the displacement must vary over the cell. The penalty is then omitted if others hold a free node of the cell.
 
-        given (conditions,), free (nodes,): conditions that prescribe the component `axis`, nodes that no wall fixes.
+        given (conditions,): whether each prescribes component `axis`; free (nodes,): whether no wall fixes the node.
 
         Return indices of the penalties (k,), their stiffness (k,), N/m, gaps (k,), m, and fractions (k, 2^d) of the
         force on each node, without the wall's part.  Also return the index of a penalty that must move but has fixed
@@ -207,9 +208,9 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties (k,) at a wall share a free node with a penalty of the same condition away from walls.
+        """Return whether each penalty (k,) is at a wall, with a free node that its condition holds away from walls too.
 
-        number (k,): conditions; nodes, N (k, 2^d): nodes and shape functions; stuck (k, 2^d): flags of nodes at a wall.
+        number (k,): index of the condition; nodes, N (k, 2^d): nodes, shape functions; stuck (k, 2^d): nodes at a wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)
@@ -232,8 +233,8 @@ class HeldCells:
         penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
         counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
 
-        row, axis, force, reached (k,): index of the penalty, its axis, force, N, and whether it is at its position;
-        told: indices of conditions that have been reported already, which are excluded.
+        For each of k prescribed components: row: index of the penalty; axis; force, N; reached: whether the position is
+        reached.  told: indices of conditions that have been reported already, which are excluded.
         """
         grid = self.grid
         comm = grid.comm

@@ -110,7 +110,7 @@ def moving(
     base : (d,), m
         Origin of the points' coordinates.
     rings
-        Whether the domains are rings (axisymmetry): a point's velocity is then that at the centroid of its ring.
+        Whether the domains are rings (axisymmetry): a point then has the velocity at the centroid of its ring.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the products of matrices (n, d, d), stored by component: numpy takes three times as long."""
+    """Return the products of matrices (n, d, d), stored by component; numpy's product takes three times as long."""
     A, B = (np.ascontiguousarray(of.transpose(1, 2, 0)) for of in (A, B))
     return sum(A[:, j, None] * B[None, j] for j in range(len(B))).transpose(2, 0, 1)
 
@@ -205,12 +205,12 @@ class InertiaForms:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the accelerations (n, d), m/s^2, at u; cells (n,); values (n, 2^d): shape functions at the places."""
+        """Return accelerations (n, d), m/s^2, at u, at places in cells (n,); values (n, 2^d): shape functions there."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return gradients for the laws, or rotations of their stress, (n, d^2), at the present u: see `chord`.
+        """Return arrays (n, d^2) at the present u: gradients for the laws, or rotations of their stress; see `chord`.
 
         chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
         """
@@ -361,7 +361,7 @@ class Inertia(Loads):
 
     @cached_property
     def flight(self) -> NDArray[np.float64]:
-        """The inertial predictor: displacement without forces, from the velocities alone, m; a local array."""
+        """The inertial predictor: displacement without forces in this substep, m; a local array."""
         return self._mass.local(self._flight)
 
     def acceleration(self, at: At) -> PETSc.Vec:

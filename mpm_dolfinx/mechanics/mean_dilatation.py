@@ -51,8 +51,7 @@ class SumsOfPart(NamedTuple):
 
 
 class FBar:
-    """F-bar modification of laws, with the volume ratio theta of the step and the conjugate mean stress pi of each
-    cell.
+    """F-bar modification of laws, with each cell's volume ratio theta of the step and conjugate mean stress pi.
 
     grid: background grid; symmetric: whether the tangents of all laws are symmetric.
     """
@@ -119,7 +118,7 @@ class FBar:
         return sums.stress.P + shared, P_F + ufl.diff(shared, F), beside, sums
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar), or of a law's work without energy, with respect to F and theta."""
+        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -185,7 +184,7 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, the sums over all parts in each cell, and the volumes (cells, 1) with F-bar."""
+        """Return the cells with F-bar, totals of `sums` over the parts in each, and volumes (cells, 1) with F-bar."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
@@ -205,7 +204,7 @@ class MeanDilatation:
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
 
-        sums: for each part, the sums (cells, quantities) of the quantities that `FBar.forms` returned.
+        sums: for each part, the integrals (cells, quantities) over each cell of `Beside` from `FBar.forms`.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
@@ -214,8 +213,8 @@ class MeanDilatation:
             axis=1,
         )
         d = c if self._symmetric else other[0]
-        # (d b^T + b c^T + e b b^T) V; means over the volume V of derivatives: b of det(Delta) by u, c and e of
-        # dPsi/dtheta by u and theta, d of P by theta
+        # (d b^T + b c^T + e b b^T) V, with means over the volume V of derivatives: b, of det(Delta) by u; c, of
+        # dPsi/dtheta by u; d, of P by theta; e, of dPsi/dtheta by theta
         columns, rows = (c + 0.5 * e * b) * volume, (d + 0.5 * e * b) * volume
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
@@ -288,7 +287,7 @@ class Cells:
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums over the parts (cells, quantities) in the cells `filled`; values: one array for each part."""
+        """Return the sums (cells, quantities) over the parts in the cells `filled`; values: one array for each part."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

@@ -53,7 +53,7 @@ class FormsOfPart(NamedTuple):
     residual: ElementForces
     tangent: ElementMatrices | StackedElementMatrices
     local: LocalUnknowns | None  # None for laws without local unknowns
-    means: SumsOfPart | None  # None without mean dilatation
+    means: SumsOfPart | None  # sums for F-bar, None for laws without it
     dried: CellSums | None  # for laws that depend on suction, see `suction_sums`
 
 
@@ -190,7 +190,7 @@ class MomentumForms:
         return [] if self._of_suction is None else self._of_suction.rows(data)
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
-        """Set the contents of the owned cells (n,) with material; return the active set: see `GhostPenalty`."""
+        """Set contents of the owned cells (n,) with material (`GhostPenalty.set_contents`); return the active set."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
@@ -259,7 +259,7 @@ class MomentumForms:
         return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return which local nodes belong to active cells of any process; cells: active cells of this process."""
+        """Return whether each local node belongs to an active cell of any process; cells: active cells of this one."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
@@ -319,7 +319,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """Norm of the rounding errors in a connected part, N, if all its unknowns had the error of this unknown."""
+        """For each unknown: norm, N, over its connected part, if all unknowns there had its rounding error."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -473,7 +473,7 @@ class MomentumProblem:
         return np.where(self.system.unknowns.map.indices[self.forms.active.now.dofs] >= 0, values, 0.0)
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces at u and their scale, N: the largest norm of the force terms."""
+        """Return the out-of-balance nodal forces at u, N, and the norm, N, of the force scales of all parts."""
         r, scales = self.residual_of_parts()
         return r, float(np.linalg.norm(scales))
 
@@ -500,7 +500,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and a list: for each of its terms the norms (parts,), N."""
+        """Return the result of `unbalanced`, and a list with the norms (parts,), N, of each of its force terms."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external

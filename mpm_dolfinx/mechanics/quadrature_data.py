@@ -59,8 +59,8 @@ class QuadratureData:
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
-    rows: tuple[NDArray[np.int64] | slice, ...]  # their indices among all points
-    of_points: PointData  # all, with the volumes and F of the points in place of F-bar's, for user-defined terms
+    rows: tuple[NDArray[np.int64] | slice, ...]  # indices in `pieces` of each part's integration points
+    of_points: PointData  # as `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def shape_gradients(self) -> NDArray[np.float64]:
         """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the positions where laws use them."""
@@ -79,7 +79,7 @@ class PiecePlaces:
 
     pieces: Places  # of all pieces
     parts: tuple[tuple[NDArray[np.int64], Places], ...]  # indices and positions of the pieces of each part
-    lever: NDArray[np.float64] | None = None  # vectors (m, d), m, from the centroid of the material in the cell
+    lever: NDArray[np.float64] | None = None  # vectors (m, d), m, to the pieces from the centroid of their cell's soil
 
 
 class QuadraturePoints:
@@ -267,9 +267,9 @@ class QuadraturePoints:
         return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta (m,), 1/Pa, at the integration points: fixed-stress operator C + factor beta V.
+        """Return beta (m,), 1/Pa, at the integration points, for the fixed-stress operator C + factor beta V.
 
-        of_fluid: return 1/K_w instead of beta; the iteration then converges for stiff skeletons only.
+        of_fluid: whether to return 1/K_w instead of beta; the iteration then converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

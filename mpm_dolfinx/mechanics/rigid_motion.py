@@ -20,7 +20,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 TURNS = 1e-3
 """Smallest rotation that is used as an initial guess, rad."""
 MEETS = 0.1
-"""Largest gap after a rotation, relative to the gap after the best translation."""
+"""Largest root mean square gap after a rotation, relative to the one after the best translation."""
 ITERATIONS = 9
 
 

@@ -34,7 +34,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides of the bodies in a stage, `setting`; loads: by name."""
+    """Loads of one kind on sides of the bodies in a stage; setting: the stage; loads: these loads by name."""
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms
@@ -59,7 +59,7 @@ class SideLoads(Acting):
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
-        """Return the value of a load at time t, s; side: positions on its side, see `on_side`."""
+        """Return the value of a load at time t, s; side: result of `Patches.positions` for its side."""
         raise NotImplementedError
 
     def _on(
@@ -118,7 +118,7 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
 
 
 class PressureForms:
-    """Forms of nodal forces of pressures, and of minus their derivative; `push`: force on the area at the start."""
+    """Forms of the nodal forces of pressures, and of minus their derivative; push: force on the area at the start."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -177,7 +177,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
     A surface counts as open if corners of its faces lie on the edges of other faces.
 
-    free (nodes, d): which displacement components walls leave free; pressures: pressures and their faces.
+    free (nodes, d): whether walls leave each displacement component free; pressures: pressures and their faces.
     """
     if not pressures:
         return True

@@ -51,7 +51,7 @@ class OwnTerms:
         self.symmetric = True
         self.holding = False
         self.rates = False
-        """Whether all tangents are symmetric; whether any term depends on u; whether any term depends on velocity."""
+        """symmetric: all tangents are symmetric; holding: a term depends on u; rates: a term depends on velocity."""
         u = forms.u
         more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)

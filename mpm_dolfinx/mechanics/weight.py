@@ -42,7 +42,7 @@ class Weight(Acting):
         self._dead, self._taken_up = PointForm(pieces.density * pull * pieces.dx, pieces), None
         if fluid_density is not None:
             grown = ufl.det(pieces.increment(u)) - 1
-            if saturation is not None:  # `density` is that of soil with saturated pores
+            if saturation is not None:  # `density` is for soil with saturated pores
                 grown = saturation * grown - (1 - saturation) * pieces.pores
             grown = fem.Constant(pieces.grid.mesh, fluid_density) * grown
             self._taken_up = PointForm(-grown * pull * pieces.dx, pieces)

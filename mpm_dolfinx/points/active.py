@@ -42,7 +42,7 @@ class ActiveSet:
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Connected part (cells,) of each local cell (1, 2, ...; 0 for empty cells), and the number of parts."""
+        """Index (cells,), from 1, of each local cell's connected part, 0 for empty cells, and the number of parts."""
         return parts_of_cells(self.grid, self.contains)
 
 

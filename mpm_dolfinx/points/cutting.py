@@ -79,7 +79,7 @@ def simplices(dim: int) -> NDArray[np.int64]:
 
 
 def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners of domains y (2^d, d, n), in 3D also the middles of their faces, and last their middles."""
+    """Return the corners y (2^d, d, n) of domains, in 3D then the middles of faces, and last the middles of domains."""
     faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
     return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
 
@@ -146,7 +146,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains are inverted: the volume between their corners is far from `volume` (n,), m^d."""
+    """Return whether each domain (n,) is inverted: the volume between its corners is far from `volume` (n,), m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -188,12 +188,12 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in units of cells, and for slicing; both are snapped to grid planes nearer than `Grid.snap`.
+    """Return positions in units of cells, and positions for slicing, snapped to grid planes nearer than `Grid.snap`.
 
-    Positions for slicing: in units of cells if all cells are equal, else in m, because domain edges are straight in m.
+    Positions for slicing are in units of cells if all cells are equal, else in m: domain edges are straight in m.
 
-    true: positions from the grid's lower corner, in units of cells; x, m: the same positions from the base; axes: array
-    axis of the components.
+    true: positions from the grid's lower corner, in units of cells; x, m: the same positions from the grid's base;
+    axes: array axis of the position's components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -360,7 +360,7 @@ def _sum(
     whole = sum_by(slots.point, size, len(slots.low[0]))[slots.point]
     kept = (size / whole > SLIVER).nonzero()[0]
     point, cell = slots.point[kept], slots.cell.take(kept, axis=1).T
-    h = grid.widths_of(cell).T  # (d, m), or of equal cells (d,)
+    h = grid.widths_of(cell).T  # (d, m), or (d,) if all cells are equal
     if grid.axisymmetric:
         x0, x1 = x[:, 0]
         squares = total(area[0] / 12 * (x0 + x1) * (x0**2 + x1**2)) + beyond / 3
@@ -412,7 +412,7 @@ def _sum(
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return (second moments about the centroid) / volume of domains (n, d, d), m^2, exact for parallelepipeds.
+    """Return (second moments about the centroid) / volume (n, d, d), m^2, of domains, exact for parallelepipeds.
 
     rings: whether the domains are sections of rings, in axisymmetry.
     """
@@ -422,7 +422,7 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (second moments about the centroid) / volume of rings (n, 2, 2), m^2, for symmetric sections.
+    """Return (second moments about the centroid) / volume (n, 2, 2), m^2, of rings with symmetric sections.
 
     spread (n, 2, 2): second moments / area of the sections, m^2; radius (n,): radius of the sections' centroids, m.
     The vector from a section's centroid to the ring's centroid is spread[:, 0] / radius.
@@ -434,7 +434,7 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 def _rings(
     grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return radii (m,), m, volume centroids (m, 2), from 0 to 1 in their cells, and `hoop` of pieces, see `Pieces`.
+    """Return radii (m,), m, of pieces, their volume centroids (m, 2), 0 to 1 in their cells, and `hoop`, see `Pieces`.
 
     cell (m, 2): grid indices of the pieces' cells.  With coordinates r, z from 0 to 1 in the cell: centroid c (m, 2) of
     the section; squares, products (m,): means of r^2 and r z over the section.
@@ -459,11 +459,11 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals over the pieces of products of two coordinates, from the lower corners of their cells.
+    """Return integrals over the pieces of products of two coordinates, relative to the lower corners of their cells.
 
-    pairs: axes of the two coordinates, ascending.  x, sums, area: vertices (d, d, m) of slices, their sums (d, m), and
-    areas (m,) of slices, projected along the first axis.  pair, total: functions that return the sum over the vertices
-    of slices of the product of two coordinates, and the sum of slice values in each slot.
+    pairs: axes of the two coordinates, ascending.  x (d, d, m): vertices of the slices; sums (d, m): sums over these
+    vertices; area (m,): slice areas projected along the first axis.  pair: function that returns the sum over a slice's
+    vertices of the product of two coordinates; total: function that returns the sum of slice values in each slot.
     """
     d = len(x)
 
@@ -586,14 +586,14 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of each member's successor in its group, the first after the last; group (n,): ascending."""
+    """Return the index (n,) of each entry's successor in its group, cyclically; group (n,): group index, ascending."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lengths of segments or areas of triangles (k+1, e, m), without a constant factor."""
+    """Return lengths of segments, or areas of triangles (k+1, e, m), up to a constant factor."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.sqrt((e[0] ** 2).sum(axis=0))
@@ -625,7 +625,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at a plane; return the parts below and above it with their owners."""
+    """Cut each simplex at its plane; return the parts below, their owners, the parts above, and their owners."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane

@@ -27,7 +27,7 @@ RADIUS = 3.0
 Source: exact. A parabola needs three points: at an end of the data these are at offsets of 0.5, 1.5 and 2.5.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of the coefficients of degrees 0, 1, 2, relative to the data; they affect only undetermined coefficients.
+"""Weights of the coefficients of degrees 0, 1, 2 / sum of data weights; they affect only undetermined coefficients.
 
 Factors of 0.01 and 100 change the pressures of a consolidating column by 1e-5 of the load.
 """
@@ -49,8 +49,8 @@ def fitted(
 ) -> NDArray[np.float64]:
     """Return the fitted values (count, width) at `count` positions, on every process; zero without data.
 
-    Data of this process: `values` (r, width) for the positions `at` (r,), from 0, with weights (r,), at offsets (r, d),
-    in spacings of the data.  degree: of the polynomials, 1 or 2.
+    Data of this process: values (r, width), their weights (r,), the index `at` (r,), from 0, of the fitted position,
+    and the offset (r, d) from it, in spacings of the data.  degree: degree of the polynomials, 1 or 2.
     """
     powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(offset.shape[1]), k)]
     size = len(powers)

@@ -103,7 +103,7 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: mean over the domain, second-order accurate; balances use the cells'.
+        Pore pressure, positive in compression: second-order accurate mean over the domain; balances use cell pressures.
     x : (n, d), m
         Centroid of the domain, in axisymmetry of its section. F and pressure are exact there for linear fields.
     origin : (n, 2^d, d), m

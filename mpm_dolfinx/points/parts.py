@@ -24,11 +24,11 @@ class Parts:
     """Connected parts of the bodies on the grid."""
 
     count: int  # number of parts
-    cells: NDArray[np.int64]  # part of each active local cell, from 0, else -1
-    nodes: NDArray[np.int64]  # part of each active local node, from 0, else -1
+    cells: NDArray[np.int64]  # index, from 0, of each active local cell's part, else -1
+    nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest values (count, ...) in each part, of values (n, ...) in parts (n,); else -inf."""
+        """Return the largest (count, ...) of the values (n, ...) in each part, else -inf; part (n,): part indices."""
         return largest_of_parts(comm, part, values, self.count)
 
 
@@ -36,7 +36,7 @@ class Parts:
 class OfParts:
     """Entries of a distributed vector on this process, with the connected part of each entry.
 
-    comm: the processes; of (n,): part of each entry; count: number of parts.
+    comm: the processes; of (n,): index of each entry's part; count: number of parts.
     """
 
     comm: MPI.Comm
@@ -68,7 +68,7 @@ class OfParts:
 
 
 def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
-    """Return the largest of the values (n, ...) in each part (count, ...), over all processes; part (n,), from 0."""
+    """Return the largest (count, ...) of the values (n, ...) in each part on all processes; part (n,): part indices."""
     out = np.full((count, *values.shape[1:]), -np.inf)
     np.maximum.at(out, part, values)
     return over_all(comm, out, MPI.MAX)
@@ -79,7 +79,7 @@ def largest_of_bodies(
 ) -> NDArray[np.float64]:
     """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
 
-    part (m,): of each column of values (k, m), from 0; inside (bodies, parts): whether the body has points here.
+    part (m,): index, from 0, of each column's part; inside (bodies, parts): whether a body has points here in a part.
     """
     largest = largest_of_parts(comm, part, values.T, inside.shape[1]).T[:, None]
     inside = over_all(comm, inside.astype(int), MPI.MAX) > 0
@@ -98,9 +98,9 @@ def relative(
 
 
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part (cells,), from 1, of each active local cell, and the number of parts.
+    """Return the index (cells,), from 1, of each active local cell's connected part, and the number of parts.
 
-    Cells with common nodes belong to one part; inactive cells have part 0. Parts are numbered in the order of their
+    Cells with common nodes belong to one part; inactive cells have index 0. Parts are numbered in the order of their
     first cells, in the same way on any number of processes.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
@@ -132,7 +132,7 @@ def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the parts of cells and their number, as `parts_of_cells`, with the parts of some pairs of cells joined.
+    """Return parts and count, results of `parts_of_cells`, after the parts of some pairs of cells have been joined.
 
     pairs (m, 2): lexicographic indices of active cells; each process may have some. All processes must call it.
     """
@@ -145,7 +145,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the part (n,), from 0, of each cell, and the number of parts; index (n, d + 1): grid indices and copy."""
+    """Return the index (n,), from 0, of each cell's part, and their number; index (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -158,7 +158,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected component of each row, from 0, and their number; rows with a common column are connected."""
+    """Return the index, from 0, of each row's component, and their number; rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
@@ -170,8 +170,8 @@ def _over_processes(
 ) -> tuple[NDArray[np.int64], int]:
     """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
 
-    own, count: part of each cell, and number of parts, on this process alone; nodes, of_node (n,): local indices of the
-    cells' nodes, and part of each node on this process.
+    own, count: index of each cell's part, and number of parts, on this process alone; nodes (n,): local indices of the
+    cells' nodes; of_node (n,): index of each node's part on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

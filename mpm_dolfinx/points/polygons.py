@@ -43,7 +43,7 @@ class Polygons:
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2), m; for polygons without area a vertex."""
+        """Centroids (n, 2), m; for polygons without area the first vertex."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])

@@ -17,7 +17,7 @@ EDGES = 4
 BENT = 1 - 3**0.5 / 2
 """Deviation of the surface from a chord, in cell sizes, above which it has a corner; flatter parts are divided evenly.
 
-Source: exact, for a chord of one cell size in a circle of this radius: the grid cannot resolve a smaller circle.
+Source: exact for a chord and a radius of one cell size; the grid cannot resolve a circle of smaller radius.
 """
 RING = np.array([0, 1, 3, 2])
 """Corners of a particle domain, anti-clockwise."""
@@ -75,7 +75,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the index in `cells` (m,), corners (m, 4, 2) and flags of surface faces (m, 4) of each new domain."""
+        """Return for m domains in chosen cells: index in `cells`, corners (m, 4, 2), flags (m, 4) of surface faces."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -104,8 +104,7 @@ def resampled(
 ) -> NDArray[np.float64]:
     """Return the surface in each cell as vertices (n, EDGES + 1, 2) from P to Q (n, 2), evenly spaced between corners.
 
-    The area between surface and chord is preserved, in axisymmetry the volume of its ring: vertices are shifted to
-    restore what is lost.
+    A shift of vertices preserves the area between surface and chord, in axisymmetry the volume of the area's ring.
 
     of (m,), x (m, 2, 2): for each segment of the given surfaces the index of its cell, ascending, and both its ends;
     around (n, 2): factor from areas to volumes, see `Grid.around`, at the lower and upper end of the first axis.

@@ -29,7 +29,7 @@ class PoreWater:
 
     # function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and maybe more
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
-    slot: NDArray[np.int64]  # (m,) cell of each piece
+    slot: NDArray[np.int64]  # (m,) index, from 0, of each piece's cell
     store: NDArray[np.float64]  # (m,) storage, m^d/Pa
     pores: NDArray[np.float64]  # (m,) pore volume, m^d
     bulk: float  # fluid's bulk modulus, Pa
@@ -40,11 +40,11 @@ class PoreWater:
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents of the cells (n,), m^d, for pressures p (m,), Pa, of their pieces."""
+        """Return the fluid contents (n,), m^d, of the cells, for pressures p (m,), Pa, of their pieces."""
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents of the cells (n,), m^d, for pi, Pa, and (S - 1) rho of the pieces (m,)."""
+        """Return the fluid contents (n,), m^d, of the cells, for pi (m,), Pa, and (S - 1) rho (m,) of the pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(

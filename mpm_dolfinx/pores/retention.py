@@ -10,7 +10,7 @@ with the porosity n, the saturated conductivity k and Biot's coefficient alpha (
 chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
 
 A user-defined curve is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  It may have
-`bishop(p)`, which returns chi; by default chi = S.  Constants of laws derived from `Retention` are not compiled.
+`bishop(p)`, which returns chi; by default chi = S.  Constants of a law derived from `Retention` are data, not compiled.
 """
 
 from __future__ import annotations
@@ -286,7 +286,7 @@ class Retentions:
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pressure of each piece (m,) minus pressure of its cell, Pa; lever (m, d), m: see the class."""
+        """Return for each piece (m,) its pressure minus its cell's pressure, Pa; lever (m, d), m: see the class."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
@@ -366,7 +366,7 @@ class SaturationAt:
     def __call__(
         self, rows: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return S, dS/dp, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): the field `retention`."""
+        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (m,), Pa; rows (m, width): the field `retention`."""
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
         return S, slope, chi, k
@@ -426,7 +426,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of suctions in the table / the law's scale.  Source: beyond it the integral is exact to a fraction of 1e-8."""
+"""Range of tabulated suctions / scale of the law.  Source: outside it the integral is exact to a fraction of 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Halving this value changes the result of scene "dry" in tests/plateaus.py by 2.1e-08
 (relative), doubling it by 2.6e-09, and finer cells by 6.6e-03.

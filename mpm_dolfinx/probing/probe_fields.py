@@ -106,7 +106,7 @@ class _Around:
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local indices (m, cells) of owned cells, -1 for others, and the data of all cells.
 
-        p: pressures of the filled owned cells, Pa; soils (k, 3): conductivity, its law and material of the pieces.
+        p: pressures of the filled owned cells, Pa; soils (k, 3): conductivity, index of law, material of each piece.
         Data columns: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan if not unique), open fractions.
         """
         grid = self._grid
@@ -132,7 +132,7 @@ class _Around:
         return local, over_all(grid.comm, out)
 
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which cells (m, cells) the fit uses, and which are connected to the probe's cell by open faces.
+        """Return whether the fit uses each cell (m, cells), and whether open faces connect it to the probe's cell.
 
         If no cell has only the probe's soil, as in thin layers, the fit uses cells with only its material, or else all.
 
@@ -154,7 +154,7 @@ class _Around:
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return which pairs (m, n) of neighbours along an axis have an open face between them."""
+        """Return whether each pair (m, n) of neighbours along an axis has an open face between its cells."""
         one, other = self._lattice.neighbours[axis, end]
         return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
@@ -207,7 +207,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return probes, offsets, heads and weights at faces to cells outside the fit, from the two-point flux."""
+        """Return indices of probes, offsets, heads (two-point flux) and weights of faces to cells outside the fit."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -228,7 +228,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return probes, offsets, heads and weights at drained sides in the fit, and which are in the probe's cell.
+        """Return indices of probes, offsets, heads, weights of drained sides, and whether each is in the probe's cell.
 
         For each side of a cell, the fit uses the mean head over the side's faces: single heads cause false gradients.
         """

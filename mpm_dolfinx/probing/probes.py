@@ -25,9 +25,9 @@ class Probes:
     """m tracked material particles."""
 
     x0: NDArray[np.float64]  # (m, d) reference positions, m
-    id: NDArray[np.int64]  # (m,) particle domain of each probe
+    id: NDArray[np.int64]  # (m,) identifier of each probe's particle domain
     xi: NDArray[np.float64]  # (m, d) local coordinates in this domain
-    bodies: tuple[Body, ...] = ()  # of the scene
+    bodies: tuple[Body, ...] = ()  # all bodies of the scene
     stressed: bool = False  # whether stresses are recorded too
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
@@ -120,7 +120,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
 def _domains_at(
     bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield the points with a domain that contains x (d,), m, in order, and the local coordinates of x."""
+    """Yield, in order, the identifier of each point whose domain contains x (d,), m, and the local coordinates of x."""
     start = 0
     for body in bodies:
         for part in in_chunks(len(body)):

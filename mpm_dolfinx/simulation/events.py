@@ -78,11 +78,11 @@ class Events:
             self._values()
 
     def within(self, step: Step, new: State) -> Found | None:
-        """Return the first event within a step that ends in the state `new`; None without an event.
+        """Return the first event within a step that ends in the state `new`, or None if there is no event.
 
         Trial steps of other lengths start from `step.start`. Brent's method chooses the lengths for functions that
         return numbers, bisection for booleans. The result is the first state found after the event, at most the
-        fraction `LOCATED` of the step later. Finally the simulation has the state `step.start`, even after an error.
+        fraction `LOCATED` of the step later. Afterwards the simulation has the state `step.start`, also after an error.
         """
         if not self._until:
             return None
@@ -140,7 +140,7 @@ class Events:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return which values have another sign than at the start of a step; a zero at the start is no event."""
+    """Return a mask of values with another sign than at the start of a step; a zero at the start is no event."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 

@@ -185,7 +185,7 @@ class Simulation:
     def reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain), in the last step.
 
-        In axisymmetry: of the full circumference, radial component positive outward. Before a stage's first step: nan.
+        In axisymmetry: force on the full circumference, radial component outward. Before a stage's first step: nan.
         """
         return self.outcome("reactions")
 
@@ -204,7 +204,7 @@ class Simulation:
 
     @property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Force, N, and moment, N m, (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by name."""
+        """Forces, N, and moments, N m, (3,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by name."""
         return self.outcome("tool_forces")
 
     @property
@@ -284,8 +284,8 @@ class Simulation:
             Whether displacements are measured from the present positions. Conditions are not adapted: a remaining
             `Displacement` of value d is then measured from there too, so it moves its side by d again.
         fields
-            New values of entries of `points.data`, (n, ...) at this process's points, or one for all points: constants
-            of materials that vary with position, state of laws, or new data of the user, which the points then store.
+            New values for entries of `points.data`: rows (n, ...) for the points of this process, or one value for all.
+            Entries are constants of materials that vary with position, state of laws, or new data of the user.
 
         Raises
         ------

@@ -29,12 +29,12 @@ MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 Adaptive steps grow over decades. At the onset of sliding they must shrink to the time scale of sliding.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step / time; without it, steps would become ever smaller at a singularity in time.
+"""Smallest adaptive step / time.  Without this limit, steps would become ever smaller at a singularity in time.
 
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Next adaptive step / last one: SAFETY / (a root of the relative error), in [SHRINKS, GROWS]; 1 instead of [1, KEEPS).
+"""Next adaptive step / last one: SAFETY / (power of error / tolerance), in [SHRINKS, GROWS]; 1 if it is in [1, KEEPS).
 
 Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for KEEPS Hairer and Wanner (1996), IV.8.
 """
@@ -44,7 +44,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""A sudden pressure change up to this multiple of the one in the previous step, both per time, is no jump."""
+"""Least (sudden pressure change / dt) of a jump, over (change / dt) in the first substep of the previous step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10
@@ -194,9 +194,9 @@ class Times:
     Parameters
     ----------
     start, now : s
-        Start of the run, and time at which it begins or continues.
+        Time of the first row of the histories, and time at which the run begins or continues.
     end, interval, given, rtol
-        t_end, dt, t_eval and rtol of `run`.
+        Arguments t_end, dt, t_eval and rtol of `run`.
     goes_on
         Whether the run continues histories of an earlier run.
 
@@ -217,7 +217,7 @@ class Times:
                 f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, s, 0 without an interval; whether every step is an output."""
+        """Output interval, s, or 0 if there is none; and whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731
@@ -243,7 +243,7 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest time, s, that an interrupted run may have after its output at time t, s."""
+        """Return the latest time, s, that a run may reach after an output at time t, s, before the next one."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
@@ -288,7 +288,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         why = "without flow of fluid, velocities have no error estimate"
-        raise ValueError(f"rtol = {line(rtol)}: {why}, must be dt alone")
+        raise ValueError(f"rtol = {line(rtol)}: {why}, must be left out")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error

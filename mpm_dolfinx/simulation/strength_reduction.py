@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors until bodies rest at one and slide at another; limit of F and 1 / F."""
+"""Ratio of successive trial factors, until bodies rest at one factor and slide at another; limit of F and of 1 / F."""
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
@@ -73,7 +73,7 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Overload in each step (n,), by trial factor: work of the viscous stress / work of the shear stress.
+        Trial factor -> overload in each step (n,): work of the viscous stress / work of the shear stress.
     newton
         Number of Newton steps of all trials.
     """
@@ -91,7 +91,7 @@ def factor_of_safety(
 
     The simulation is unchanged. A scene that cannot stand need not be run: trials start from an elastic step of dt.
     Suction, as part of the effective stress, adds to the strength. Tool friction is not divided. If a thin weak surface
-    layer slides alone, the factor depends on `rtol`, by the layer's share of the load. All processes must call it.
+    layer slides alone, the factor depends on `rtol` and the layer's share of the load. All processes must call this.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def factor_of_safety(
         An argument is invalid; a soil has a strength that cannot be divided; bodies have no stress.  Bodies do not
         slide with 1/16 of their strength, or do not come to rest with 16 times their strength.
     GaveUp
-        A step of a trial does not converge at any length.
+        A step of a trial does not converge, however short.
     """
     if not isinstance(getattr(simulation, "scene", None), Scene):
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
@@ -199,7 +199,7 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """A trial that the time loop runs; newton: list to which each step appends its number of Newton steps."""
+    """A trial for the time loop; newton: list to which each time step appends its number of Newton steps."""
 
     scene: Scene
     state: State
@@ -273,7 +273,7 @@ class _Weakened:
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial from the state `start`; strength: function of name and strengths (n,)."""
+        """Return a trial from the state `start`; strength: function of name and values (n,) -> new values (n,)."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
@@ -349,7 +349,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the strengths of the points, name -> (n,); zero for materials without this strength."""
+    """Return a dict, name of a strength -> values (n,) of the points; zero in materials without it."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

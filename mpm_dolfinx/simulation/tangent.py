@@ -23,7 +23,7 @@ class Tangent:
     """Derivatives of the residuals with respect to displacements and pressures, for a step by backward Euler.
 
     Forces change by `stiffness` du + `pressure` dp, N, and fluid contents by `content` du + `storage` dp, m^d, for du
-    (n,), m, and dp (m,), Pa; in plane strain per metre of thickness. Blocks of the pressures are None without fluid.
+    (n,), m, and dp (m,), Pa; in plane strain per metre of thickness. Without fluid, `pressure` and all below are None.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Tangent:
     pressure : (n, m)
         Derivative of forces with respect to pressures.
     content : (m, n)
-        Derivative of fluid contents with respect to displacements, without that of the fluxes.
+        Derivative of fluid contents with respect to displacements, without the derivative of the fluxes.
     storage : (m, m)
         Derivative of fluid contents with respect to pressures.
     cells : (m,)
@@ -65,7 +65,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
     scene, state = simulation.scene, simulation.state
     numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
     if scene.grid.comm.size > 1:
-        raise ValueError(f"tangent: has matrices of one process, not of {scene.grid.comm.size}")
+        raise ValueError(f"tangent: the scene runs on {scene.grid.comm.size} processes, must be on one")
     start = set_up(scene, state, dt)
     acting = start.begun(start.acting[-1]._replace(substep=METHODS["backward-euler"][0]), None)
     both = balances(scene, start, acting)

@@ -95,7 +95,8 @@ def run(
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     first_step, max_step
         With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 18 rtol times
-        the time for diffusion through a cell, and at least a thousandth of the first output interval.
+        the time for diffusion through a cell, but 0.001 to 1 times the first output interval; with inertia at most the
+        time in which a wave crosses a cell.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
         number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
@@ -126,7 +127,7 @@ def run(
     ValueError
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        A step failed at any length; the exception has the histories so far. `state` is that after the last good step.
+        A step failed, however short; the exception has the histories so far. The last good step has set `state`.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)

@@ -11,8 +11,8 @@ Factorisation of both on all of four processes took 1.7 times as long, because t
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
 (`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s
-and 5.0e7, with minimum degree 6 to 12 s and 7.5e7, with MUMPS 6.2 s and 5.3e7. With a tenth of the unknowns these three
-orderings take 80, 110, 120 ms; with fewer unknowns, equal times.
+and 5.0e7, with minimum degree 6 to 12 s and 7.5e7; with MUMPS 6.2 s and 5.3e7. With a tenth of the unknowns the first
+three take 80, 110 and 120 ms; with fewer unknowns, equal times.
 
 The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS MUMPS takes 1/2 to 1/3
 of the time.
@@ -47,7 +47,7 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve, and after changes of A; if `symmetric`, as L D L^T.
 
-    gathered: whether one process, the last one, holds the factors; this suits many solves with the same matrix.
+    gathered: whether only the last process holds the factors; this suits many solves with the same matrix.
     package: package of the factorisation; None: PETSc on one process, MUMPS on several.
     """
     if symmetric:
@@ -204,7 +204,7 @@ class SingleFactors:
         self._solver.value[0].setUp()
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
-        """Return a solver for matrices with this sparsity pattern, a solution and a right-hand side."""
+        """Return a solver for matrices with this sparsity pattern, and vectors for solution and right-hand side."""
         A = PETSc.Mat().createAIJ(len(rows) - 1, csr=(rows, columns, np.zeros(len(columns))), comm=PETSc.COMM_SELF)
         return direct_solver(A, self._name, self._symmetric, gathered=True), *A.createVecs()
 

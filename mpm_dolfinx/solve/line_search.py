@@ -4,12 +4,12 @@
 Without yield the step is full, even if the residual grows, because rotations of a bending body cause a spurious stretch
 at first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
-In yielding soil the step is full if the residual falls, or if the residual forces at its end do less than half of the
-initial work along it. Otherwise the search ends where this work is about zero (Matthies and Strang 1979). At that step
-length, soil that unloads is elastic, also in the next tangent. The work includes that of the fluid's residual, because
-the forces' work alone nearly vanishes if only the fluid is out of balance. Shorter steps with smaller residuals would
-lead to more short steps. Bracketed secants find the zero. Soil that has lost its strength needs several secants: with
-one secant, a slumping bank takes twice the Newton steps.
+In yielding soil the step is full if the residual forces at its end do less than half of the initial work along it; if
+the residual falls, up to all of this work is allowed. Otherwise bracketed secants look for the step length at which the
+work is zero, until it is less than half of the initial work (Matthies and Strang 1979). Near zero work, soil that
+unloads is elastic, also in the next tangent. The work of the fluid's residual is added, because the forces alone do
+nearly no work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
+Soil that has lost its strength needs several secants: with one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
 overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
@@ -72,10 +72,10 @@ class Search:
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Search | None:
-        """Return the next trial; work: that of the last trial / initial work, nan if not finite; None: the search ends.
+        """Return the next trial, or None if the search ends; work: work after the last trial / initial work, or nan.
 
-        growth: factor by which the residual grew. A full step that does not increase the residual ends the search with
-        up to the initial work. The next trial is that of a secant, or of bisection if a bound stays a second time.
+        growth: factor by which the residual grew. A full step that does not increase the residual ends the search if
+        |work| <= 1. A secant gives the next trial, or bisection if one of the bounds stays a second time.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

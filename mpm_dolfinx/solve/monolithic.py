@@ -17,10 +17,10 @@ GMRES takes 8 iterations to 1e-5, and 12 with algebraic multigrid on P.
 
 At nu = 0.499 the cycle is poor, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too many
 iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
-takes too many iterations.  With factors of an earlier tangent a solve takes about 10, with new ones 4 to 6.  A step
-then takes 6.2 s, but 8.5 s with new factors for each tangent; four steps of yielding soil, 12^3 cells, 33 and 41 s.
-MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations (22 at nu
-= 0.49 with contrasts of 1e3).
+takes too many iterations.  With factors of an earlier tangent a solve takes about 10 iterations, with new factors 4 to
+6.  A step takes 6.2 s, but 8.5 s with new factors for each tangent; four steps of yielding soil, 12^3 cells, 33 s and
+41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations
+(22 at nu = 0.49 with contrasts of 1e3).
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
 wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long
@@ -48,7 +48,7 @@ from mpm_dolfinx.solve.solver_choice import SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. With scales of both residuals 5e5 apart, rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. Where the two scales had a ratio of 5e5, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()
@@ -104,7 +104,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return (fluid volume that the residual forces displace) / (norm of these forces), m^d/N, by part (parts,)."""
+        """Return (fluid volume displaced by the residual forces) / (norm of these forces), m^d/N, by part (parts,)."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -227,7 +227,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if its rate in the last many / 4 iterations predicts a count above `many`."""
+    """Return a monitor that ends a solve if its rate in the last many / 4 iterations predicts more than `many`."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

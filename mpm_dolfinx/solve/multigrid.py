@@ -5,9 +5,9 @@ A coarse unknown belongs to a node, or a cell, of a grid with half as many cells
 interpolated bilinearly between nodes, pressures between centres of cells. Coarse matrices are Q^T A Q (Galerkin) with
 the interpolation Q, so cut cells, penalties and laws need no special treatment.
 
-With 504000 displacements and 251000 pressures in 2D (10^6 points) both hierarchies take 0.33 s, coarse matrices 0.1 s
-for each tangent, a cycle 0.06 s. A step takes 2.6 s in all, but 7.6 s with factors (including ordering). A wet cube of
-20^3 cells in shear, 16 Newton steps, takes 2.0 s; with smoothed aggregation (GAMG) 11.6 s in as many iterations.
+With 504000 displacements and 251000 pressures in 2D (10^6 points) both hierarchies of grids take 0.33 s, the coarse
+matrices of a tangent 0.1 s, a cycle 0.06 s. A step takes 2.6 s, but 7.6 s with factors (including ordering). A wet cube
+of 20^3 cells in shear, 16 Newton steps, takes 2.0 s; with smoothed aggregation (GAMG) 11.6 s in as many iterations.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def multigrid_solver(
         Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
         interpolated by itself.
     held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies; interpolated displacements vanish there.
+        Fixed degrees of freedom in cells of bodies, as `places`; interpolated displacements vanish there.
     nodal
         Whether the unknowns belong to nodes.
     coarsest
@@ -155,7 +155,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return indices of fine unknowns (m,), coarse positions (m, d + 1) and weights (m,) of the interpolation."""
+    """Return fine unknowns (m,), coarse places (m, d + 1) and weights (m,) of the entries of an interpolation."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
@@ -179,7 +179,7 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices (n,) of coarse unknowns, NONE for other candidates, and whether this process owns them (n,).
+    """Return for each candidate its index (n,) as a coarse unknown, else NONE, and whether this process owns it (n,).
 
     The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 

@@ -44,7 +44,7 @@ from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
 INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations cause volume changes
 MOMENTUM_STEPS = 10
-REBALANCED = 6  # largest number of iterations with changing contacts, divided by that without
+REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
 """Largest residual after a linear solve, divided by the residual before it.  Halving this value changes the result of
 scene "soil" in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
@@ -119,7 +119,7 @@ def solve_substep(
     ahead
         Function that returns (u, p) extrapolated from the last steps, in active dofs and cells, or None.
     as_reset, key
-        See `OnGrid.as_reset`. Linear laws use this tangent while the key stays the same.
+        See `OnGrid.as_reset`. Linear laws use the tangent at the reset while the key stays the same.
     report
         Report of the step, to which this function adds the counts of the substep.
     kept
@@ -133,7 +133,7 @@ def solve_substep(
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
     serves = report.newton > 0 and momentum.smooth
-    follows = not report.history or max(report.history[0]) ** 2 <= solvers.plan.keep  # the first substep began there
+    follows = not report.history or max(report.history[0]) ** 2 <= solvers.plan.keep  # first residual small
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual shows a failed solve
         errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves, ahead if follows else None)
         took = newton.report
@@ -168,8 +168,8 @@ def note_pressures(
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
-    seconds: weight of the first rates in the step, s; dt: length of the step, s; of_bodies: function of active owned
-    cells (n,) and values (k, n): the largest (k, bodies) of each body, `Motion.of_bodies`.
+    seconds: weight of the first rates in the step, s; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
+    function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
     """
     if storage is None or not report.newton:
         return
@@ -214,7 +214,7 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve both balances by Newton's method; a tangent serves while it converges, with linear laws many steps.
+        """Solve both balances by Newton's method; a tangent is kept while it converges, with linear laws many steps.
 
         serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """
@@ -274,9 +274,9 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors at the starting point: a guess with a smaller residual than the present (u, p), if any.
+        """Return the errors at the chosen start, and the present (u, p) if another start was chosen, else None.
 
-        A Newton step `ahead` must leave a small residual: its square. Also return the other start, or None.
+        `ahead` is chosen if the square of its residual is small; else the guess of least residual, in each part.
         """
         start = self._iterate()
         if ahead is not None:
@@ -391,12 +391,12 @@ class Newton:
             raise NotConverged(f"no convergence in {count} iterations", self.report.history)
 
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
-        """Assemble both residuals; store and return their norms relative to their scales.
+        """Assemble both residuals; return the norms of each relative to its scale, and add them to the history.
 
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Residuals within round-off are returned as 0, but stored as they are, with scales >= round-off / tolerance.
+        Residuals within round-off are returned as 0; the history has their norms, with scales >= round-off / tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -494,7 +494,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
-        """Return the errors after a trial step, infinite where a law cannot be evaluated, and its exception or None."""
+        """Return the errors after a trial step and None; if a law fails, infinite errors or None, and the exception."""
         try:
             return self._errors(before and before.start), None
         except NotConverged as failed:

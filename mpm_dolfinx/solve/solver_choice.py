@@ -31,14 +31,14 @@ class Thresholds:
         and a solve take, with 196000 unknowns: PETSc 2.6 and 0.02 s, MUMPS with OpenBLAS 0.7 and 0.09 s; with 51000
         unknowns: PETSc 0.25 and 0.004 s, MUMPS 0.12 and 0.02 s. A Newton step takes five to ten solves.
     gathering
-        Largest number of processes for which a single one holds the factors of many solves. Factorisations on all of
-        four processes took 1.7 times as long, because these share the memory's bandwidth.
+        Largest number of processes for which a single process holds the factors that many solves use. Factorisations
+        on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
         Iterations of a solve above which a direct solver replaces multigrid, or the next tangent renews the factors of
-        the fixed-stress operator.  Renewal after 12, 25, 50 or 500 gives equally many Newton steps (footing, 9 cells).
+        the fixed-stress operator.  Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
@@ -144,9 +144,9 @@ def plan(
     scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05, 179
     and 83 with 0.01, and 174 and 94 with 0.002. In 3D tangents cost more: a beam takes up to a fifth longer with 0.01.
 
-    The relative tolerance of linear solves is at least 1e-5, or 1e-3 with multigrid in 3D. With a factorised stiffness
-    an iteration is cheap, and a looser tolerance costs Newton steps: a footing on 21 cells (backward Euler) takes 299
-    Newton steps with 1e-5, and 370 with 1e-3.
+    The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. With a
+    factorised stiffness an iteration is cheap, and a looser tolerance costs Newton steps: a footing on 21 cells
+    (backward Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
 
     Parameters
     ----------

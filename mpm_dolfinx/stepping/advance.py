@@ -113,8 +113,8 @@ class Motion:
         stays
             Whether points that hardly move may keep their pieces.
         carried
-            Function that returns new velocities (`Mass.carried`) for the points' motion (n,) in cells, 0 for kept
-            pieces.
+            Function that returns new velocities, `Mass.carried`; argument (n,): motion of the points / cell size, 0 if
+            they keep their pieces.
 
         Raises
         ------
@@ -190,9 +190,9 @@ class Motion:
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
         """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
 
-        They follow the trend, see `Trend.over`. A second substep continues the first one, if its length (s) is > 0; the
-        deviation follows the trend. Domains move affinely. A cell takes the mean of its pieces, a node that of its
-        cells, by volumes. Ten load steps of a drained beam take 50 Newton steps from rest, 29 from this guess.
+        They follow the trend, see `Trend.over`. If first > 0, the length of a first substep (s), its change, times
+        seconds / first, is added. Domains move affinely. A cell takes the volume mean of its pieces, a node that of its
+        cells. Ten load steps of a drained beam take 50 Newton steps from rest, 29 from this guess.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
@@ -231,7 +231,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return nodal values, a local array, at nodes of parts in which all points keep their pieces; else zero."""
+        """Return nodal values, a local array: unchanged at nodes of cells whose points keep their pieces, else zero."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -267,7 +267,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F of the points after a step: (n, 3, 3), or (n, 2, 2) if this suffices for the laws.
 
-        F is the mean of Delta F_n over the pieces of the point, scaled to the mean of their determinants.
+        F is the mean of (increment of F) F_n over the pieces of the point, scaled so that det F is the mean of theirs.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -413,14 +413,14 @@ class Motion:
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
 
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
-        """Return which parts (count,) have no open sides, and no sources at the end of the step."""
+        """Return a mask (count,) of connected parts without open sides, and without sources at the end of the step."""
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
         return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
 
     def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest values (k, bodies) of each body; values (k, m): of these active owned cells (m,)."""
+        """Return the largest values (k, bodies) in each body; values (k, m): in the active owned cells `cells` (m,)."""
         (part, count), points = on_grid.active.parts_of_cells, on_grid.cut.points
         inside = np.zeros((len(self._bodies), count), dtype=bool)
         inside[self._body(points), on_grid.parts[0]] = True
@@ -431,7 +431,7 @@ class Motion:
         return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of boxes with the reference volumes of the points' domains."""
+        """Return the edge lengths (n, d), m, of boxes with the reference volumes of the points' domains."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
         size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])
@@ -455,7 +455,7 @@ class Motion:
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces at time t, s, with pressures to be moved; some: whether other pieces stay."""
+        """Return the pieces with pressures, at time t, s, for the next grid; some: whether some pieces stay."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J

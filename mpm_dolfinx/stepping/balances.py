@@ -110,7 +110,7 @@ class Balances(NamedTuple):
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep; forces of supports then include the reactions to the initial stress."""
+    """Return the loads of each substep; with `State.rest`, supports also react to the initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -118,7 +118,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points after a step with the data that loads store; raise if a load forbids their positions."""
+    """Return the points after a step with data that loads store; raise an error if a load forbids their positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:

@@ -209,7 +209,7 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset; within the context u is 0, and p is that of the reset."""
+        """Yield the integration points at the last reset; within the context u is 0, and p as at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -297,7 +297,7 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return the ratio (m,) of elastic to tangent shear modulus at the start of the step."""
+        """Return elastic / tangent shear modulus of the pieces (m,) at the start of the step."""
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
@@ -416,7 +416,7 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return which points (n,) keep their pieces: their connected part, with parts in contact, hardly moves."""
+        """Return a mask (n,) of points that keep their pieces: their part and parts in contact with it hardly move."""
         part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
         return self.cut.valid(points, part, count)[part]
 
@@ -429,14 +429,14 @@ class OnGrid(Keyed):
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
-        """Connected part (n,) of each point, from 0, and the number of parts.
+        """Index (n,), from 0, of the connected part of each point, and the number of parts.
 
         The unknowns of a part are independent of all other parts.
         """
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the part (n,) of each point, from 0, by the parts of cells, from 1; and the number of parts."""
+        """Return the index of each point's part (n,), from 0, and `count`; part: index of each cell's part, from 1."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -460,7 +460,7 @@ class System:
     on_grid
         The bodies on the grid.
     dofs
-        Unrolled local unknowns of the displacement.
+        Local indices of the unknown components of displacement.
     stiff
         Whether plates or prescribed displacements have a penalty.
     symmetric
@@ -567,7 +567,7 @@ class Assembled(Keyed):
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return the rounding error of the residual at the active local nodes (nodes,), N.
 
-        Two terms are added: one proportional to the stiffness of the cells at a node, one to that of penalties there.
+        It has two terms: one is proportional to the stiffness of the cells at a node, one to the penalties there.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)

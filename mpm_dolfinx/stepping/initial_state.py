@@ -142,7 +142,7 @@ def begin_stage(
     if scene.initial.given:
         gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
-        what = f"stage: add: body {add[0]}: domains of other bodies have been renewed"
+        what = f"stage: add: body {add[0]}, while domains of other bodies have been renewed"
         raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
@@ -185,7 +185,7 @@ def _released(
     cut = start.on_grid.cut
 
     def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return which components (nodes, d) lie along `axes`, at nodes of cells that contain faces of `some`."""
+        """Return a mask (nodes, d) of components along `axes`, at nodes of cells that contain faces of `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
@@ -278,7 +278,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points with added bodies, and the points of these alone; each is placed after the bodies below it."""
+    """Return the points with added bodies, and those of added bodies alone; first bodies that touch placed bodies."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -441,7 +441,7 @@ def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArr
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the momentum balance with zero displacement and rates; the points include the strain of a found u."""
+    """Return the momentum balance with zero displacement and rates; the points include the strain found so far."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)

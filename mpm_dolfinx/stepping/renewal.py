@@ -13,8 +13,7 @@ Remainders of old domains outside these cells become domains. Masses, volumes an
 each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
 These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
 range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
-too. Cells with elastic soil, several bodies, prescribed displacements, or several surface
-crossings are unchanged.
+too. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings are unchanged.
 """
 
 from __future__ import annotations
@@ -86,18 +85,18 @@ class Renewal:
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
 
     def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which domains (n,) are longer than `LONGEST` cells, or partly inverted."""
+        """Return a mask (n,) of domains that are longer than `LONGEST` cells, or partly inverted."""
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return at which points (n,) soil has yielded or was renewed; False for laws without the state `plastic`."""
+        """Return a mask (n,) of points that yielded or were renewed; False for laws without the state `plastic`."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return which points (n,) may be renewed: without probes, and not in a part that keeps its pieces."""
+        """Return a mask (n,) of `flowed` points that may be renewed: without probes, and not with kept pieces."""
         free = self.flowed(state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
@@ -191,7 +190,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return keys of outer faces, and the index of each face's set of conditions; -1: the set forbids renewal."""
+        """Return keys of outer faces, and the index of each face's set of conditions; -1: not to be renewed."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)

@@ -56,7 +56,7 @@ class Result:
     memory
         Peak memory of all processes with libraries, MB.
     imbalance
-        (Largest number on a process) / (mean number) at the end of the run, see `summary.imbalance`.
+        (Largest number on a process) / (mean) of points, pieces, cells at the end of the run, see `summary.imbalance`.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -132,7 +132,7 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Force, N, and moment, N m, (times, d + 1), in 3D (times, 6), of each tool and contact on bodies, by name."""
+        """Forces, N, and moments, N m, (times, 3), in 3D (times, 6), of each tool and contact on bodies, by name."""
         return self.outcome("tool_forces")
 
     @cached_property
@@ -197,7 +197,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return a table of the time, s, of each part and its fraction of the wall time, memory and imbalance."""
+        """Return a table: time, s, of each part of the run, its fraction of the wall time; memory; imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run
@@ -210,7 +210,7 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """Error that ends a run: a step fails at any length.
+    """Error that ends a run: a step fails, however short.
 
     The simulation is in the state of the last good step. A new run may continue it with other conditions or steps.
 

@@ -186,7 +186,7 @@ class Scene:
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        Gravity is that of `stage` at the start t, s, of a step.  If it is a function, each step resets the grid.
+        t, s: start of a step, the time of the gravity of `stage`.  If gravity varies, each step resets the grid.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
@@ -217,7 +217,7 @@ class Scene:
         """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and followed_tool(self.grid, first.given) is None:
-            raise ValueError(f"grid: follow = {line(follow)}: not in the first stage, must be in its conditions")
+            raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be in its conditions")
 
     def followed(self, state: State) -> State:
         """Return the state for its next step, and move the grid to the lines of that step."""
@@ -242,7 +242,7 @@ class Scene:
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }
         if found := [what for what, so in has.items() if so]:
-            what = f"Numerics: renewal = True: the scene {' and '.join(found)}"
+            what = f"Numerics(renewal=True): the scene {' and '.join(found)}"
             raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in 2D")
         return Renewal(self.bodies, self.materials)
 

@@ -51,9 +51,9 @@ from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Tied | Drained | Inflow | Rain | Tool | Contact
 """Conditions on the bodies."""
 KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, QuietSides, Ties, Tools, Contacts)
-"""Loads in the balance of momentum, for conditions without a method `acting`."""
+"""Classes of loads in the balance of momentum, for conditions without a method `acting`."""
 FED: tuple[type[Feeding], ...] = (DrainedSides,)
-"""Terms in the balance of fluid, for conditions without a method `feeding`."""
+"""Classes of terms in the balance of fluid, for conditions without a method `feeding`."""
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
@@ -122,7 +122,7 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if the stage begins and cannot begin at this place."""
+        """Raise an error if this is the stage's first step, and the positions of bodies or tools do not allow it."""
         for one in self.acting if place.begins else ():
             one.check_start(place)
 

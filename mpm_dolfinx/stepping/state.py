@@ -45,7 +45,7 @@ class StepControl:
     change : (bodies,), Pa
         Largest pressure change of each body since the start of the run.
     first : (bodies,), Pa/s
-        Value `first` of the last step in `Report`, divided by the length of the step.
+        `Report.first` of the last step, the pressure change in its first substep, divided by the length of the step.
     start : (2, bodies), Pa
         Smallest and largest cell pressures of each body at the start of the run; None before the first step.
     motion : J^(1/2)
@@ -106,9 +106,9 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return changes (n, ...) in a time (s), by the polynomial through the last states; implicit: as by Euler.
+        """Return changes (n, ...) in a time (s) by the polynomial through the last states; implicit: end rate x time.
 
-        If first > 0, a first implicit substep of this length (s), continued at its rate, is subtracted.
+        If first > 0, the implicit change in a first substep of this length (s), times seconds / first, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -202,7 +202,7 @@ class State:
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return data of the pieces by name where points keep their pieces, and `fresh` (m, ...) elsewhere.
+        """Return the data `name` of the pieces (m, ...): stored where points keep their pieces, elsewhere `fresh`.
 
         point : (m,)
             Index of the point of each piece.

@@ -118,8 +118,8 @@ class BiotFEM:
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity as a function of time.
     terms
-        User-defined terms as for `Simulation`, but not on sides: see `user_functions`, `Source`.
-        q is a test function of the elements for pressure.
+        User-defined terms as for `Simulation`, but not on sides: see `user_functions`, `Source`.  The argument q of a
+        `Source` is a test function of the elements for pressure.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1 displacement, cellwise pressure, two-point fluxes.
     numerics
@@ -480,7 +480,7 @@ class BiotFEM:
         return _compat.petsc_vec(out)
 
     def step(self, dt: float) -> tuple[int, float]:
-        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` keeps the state."""
+        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` leaves the state."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         newton, worst = 0, 0.0
         for substep in self._substeps:

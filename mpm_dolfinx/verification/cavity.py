@@ -25,7 +25,7 @@ CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newt
 
 
 class _Rings:
-    """A law at n rings; stretches (n, 2): radial and hoop; state: name -> (n, ...); `start`: initial state."""
+    """A law at n rings.  Stretches (n, 2) are radial and hoop; a state is name -> (n, ...); `start`: initial state."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -42,7 +42,7 @@ class _Rings:
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
 
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
-        """Return the normal Kirchhoff stresses (n, 2), Pa; repeat: number of copies of all rings in the stretches."""
+        """Return the radial and hoop Kirchhoff stress (n, 2), Pa; the stretches are of `repeat` copies of all rings."""
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
@@ -126,7 +126,7 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return (total radial stress at the outer radius - at the wall), and effective radial stress at the wall, Pa.
+    """Return (total radial stress at the outer radius) - (at the wall), and effective radial stress at the wall, Pa.
 
     The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii: successive radii a of the
     cavity, in small steps.

@@ -37,7 +37,7 @@ ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # limits: Newton iterations, halvings o
 
 @dataclass(frozen=True)
 class ElementTest:
-    """Results of an element test, one entry for each step; the first entry is the start.
+    """Results of an element test: arrays with one row for the start, and one for each step.
 
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.

@@ -181,7 +181,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, Pa, and its integral from 0 to x divided by a, Pa, (2, ...)."""
+        """Return the pressure, Pa, and (integral of the pressure from 0 to x) / a, Pa, as one array (2, ...)."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)

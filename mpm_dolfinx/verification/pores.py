@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pores, in the finite element reference, that drain under suction: see `retention`; pressures in a given unit."""
+"""Pores of the finite element reference, which drain under suction, see `retention`; pressures have a given unit."""
 
 from __future__ import annotations
 
