@@ -51,7 +51,7 @@ def documented(folder: Path) -> dict[str, str]:
 
 
 def names(folder: Path) -> str:
-    """Return a page of all public names, as links.  Unlike the search, the page needs no server."""
+    """Return a page of all public names, as links.  The page needs no server, unlike the search box."""
     found = documented(folder)
     rows = [f"* [`{name}`]({found[name]}.md#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
     return "# All names\n\n" + "\n".join(rows) + "\n"

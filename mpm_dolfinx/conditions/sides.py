@@ -56,8 +56,8 @@ class Sides:
 
         The last prescribed node also moves half a cell of the side outside the region.  If the region covers at most
         half of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side
-        inclined to the grid, the faces end half a cell before the end of the region.  Both apply only where the side
-        continues outside the region and no other condition prescribes the same components there.
+        inclined to the grid, the faces end half a cell before the end of the region.  Both rules apply only where the
+        side continues outside the region and no other condition prescribes the same components there.
 
         condition: the prescribed displacement; others: other prescribed displacements of the same components.
         """

@@ -46,7 +46,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the face of each position; `number` (n,) is its index among the renewed faces, negative if seeded."""
+        """Return the renewed faces with indices `number` (n,); rows of negative indices, of seeded faces, are `old`."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)

@@ -37,7 +37,7 @@ from mpm_dolfinx.grid.grid import Grid, in_chunks
 BATCH, MANY = 2**10, 2**12
 """Number of points in a batch of element matrices, which fits into the cache; and in one call of an expression.
 
-A call for few points uses the smaller number, because a bound kernel is called for all of its cells.
+An expression always evaluates a whole list of cells, of either length.  The last few points use the shorter list.
 """
 
 

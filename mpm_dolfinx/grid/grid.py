@@ -91,7 +91,7 @@ def polynomial(
     """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
 
     `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
-    index of the cell of each value.  With an axis `without`, the field does not depend on this axis.
+    index of the cell of each value.  without: an axis along which the field is constant.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -369,7 +369,7 @@ class Grid:
     def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
         """Move the lines of a grid with `follow` to new coordinates (n,), m, along each axis, relative to the base.
 
-        Afterwards all positions equal the positions in a new grid with these lines, and do not depend on earlier lines.
+        Afterwards nodes, cells and the mesh have the same digits as in a new grid with these lines.
         """
         if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
             self._spacing = self._spaced(tuple(lines))

@@ -83,7 +83,7 @@ class FBar:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Return the stress and the sums of one part, whose Q1 cells would lock without F-bar.
+        """Return the stress and the cell sums of points with one law, whose Q1 cells would lock without F-bar.
 
         Parameters
         ----------

@@ -72,7 +72,7 @@ class MomentumForms:
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the integration points then have `density`, kg/m^3, at the start of the step.
     materials
-        Materials of the scene, and its fluid. With retention curves the points also carry retention, lever and pores.
+        Materials of the scene, and its fluid. With retention curves the points also have `retention`, `lever`, `pores`.
     at_points
         Whether bodies are integrated at their material points.
     terms

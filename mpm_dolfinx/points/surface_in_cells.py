@@ -106,8 +106,8 @@ def resampled(
 
     A shift of vertices preserves the area between surface and chord, in axisymmetry the volume of the area's ring.
 
-    of (m,), x (m, 2, 2): for each segment of the given surfaces the index of its cell, ascending, and both its ends;
-    around (n, 2): factor from areas to volumes, see `Grid.around`, at the lower and upper end of the first axis.
+    of (m,): index of each segment's cell, ascending; x (m, 2, 2): both ends of each segment, from 0 to 1 in its cell;
+    around (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])

@@ -2,7 +2,7 @@
 """Cell pressures from the pore water of the pieces of particle domains, in unsaturated soil.
 
 A piece has storage s (m^d/Pa) and pore volume n (m^d).  Its fluid content minus that at zero pressure is
-c(p) = s pi(p) + n (S(p) - 1) rho(p), with the mass potential pi and the density rho relative to zero pressure.  In a
+c(p) = s pi(p) + n (S(p) - 1) rho(p), with pi = K_w (exp(p / K_w) - 1) and rho = exp(p / K_w).  In a
 piece away from its cell's centroid the pressure is p + o, with an offset o.  S depends on the soil of the piece.
 """
 

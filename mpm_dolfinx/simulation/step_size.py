@@ -44,7 +44,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""Least (sudden pressure change / dt) of a jump, over (change / dt) in the first substep of the previous step."""
+"""A pressure jumps if it changes by more than AGAIN times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
 RESOLVED = 10

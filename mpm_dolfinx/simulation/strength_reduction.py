@@ -8,8 +8,8 @@ follows the motion in time. The criterion is the overload: viscous stress / shea
 comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload remains, equal to
 the missing strength, at any viscosity and cell size.
 
-All trials start from the stresses of soil with unlimited strength. Bodies in equilibrium have such stresses. Bodies
-that cannot stand, and were therefore not run, reach them in an elastic step.
+Before the trials, soil with unlimited strength takes one step. Bodies in equilibrium keep their stresses in this step.
+Bodies that cannot stand, and were therefore not run, get elastic stresses in it.
 """
 
 from __future__ import annotations

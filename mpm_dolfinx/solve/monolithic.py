@@ -52,7 +52,7 @@ Sealed bodies exchange nearly no fluid. Where the two scales had a ratio of 5e5,
 """
 
 IDLE = object()
-"""Context between solves, because PETSc keeps the last context and all its references."""
+"""Replaces a context of PETSc after each solve; otherwise PETSc would keep all objects of the last solve."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""

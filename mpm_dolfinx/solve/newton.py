@@ -168,7 +168,7 @@ def note_pressures(
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
 
-    seconds: weight of the first rates in the step, s; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
+    seconds: factor, s, of the rates of the first substep; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
     function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
     """
     if storage is None or not report.newton:

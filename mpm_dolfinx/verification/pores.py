@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pores of the finite element reference, which drain under suction, see `retention`; pressures have a given unit."""
+"""Unsaturated pores of the finite element reference, see `pores.retention`; pressures are multiples of a unit."""
 
 from __future__ import annotations
 
