@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unsaturated pores of the finite element reference, see `pores.retention`; pressures are multiples of a unit."""
+"""Unsaturated pores of the finite element reference, see `retention`; pressures are multiples of a unit."""
 
 from __future__ import annotations
 
