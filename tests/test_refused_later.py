@@ -96,6 +96,6 @@ def test_an_observer_takes_the_simulation():
 
 
 def test_stresses_at_rest_need_a_weight_or_a_surcharge():
-    with pytest.raises(ValueError, match="K0 without gravity at the start"):
+    with pytest.raises(ValueError, match="K0 has neither gravity at the start nor surcharge"):
         scene(gravity=lambda t: (0, -9.81 * t), initial_stress=mpm.K0(0.5))
     scene(gravity=lambda t: (0, -9.81 * t), initial_stress=mpm.K0(0.5, surcharge=1e4))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeVar
 
 from mpi4py import MPI
@@ -32,6 +33,15 @@ class Traffic:
 traffic = Traffic()
 
 
+@cache
+def _lasting(handle: int) -> PETSc.Vec:
+    """Return an object that keeps PETSc's duplicate of a communicator until the program ends.
+
+    At the end PETSc makes new duplicates, collectively.  A process without objects then waited for processes with some.
+    """
+    return PETSc.Vec().create(MPI.Comm.f2py(handle))
+
+
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
@@ -51,6 +61,7 @@ class Exchange:
         place[order] = np.arange(len(destination)) + np.repeat(first_there - (np.cumsum(sent) - sent), sent)
         self._counts = len(destination), int(received.sum())
         self._away = tuple(np.delete(counts, comm.rank) for counts in (sent, received))
+        _lasting(comm.py2f())
         self._sf = PETSc.SF().create(comm)  # communicates only with processes that receive rows
         self._sf.setGraph(self._counts[1], None, np.column_stack([destination, place]).astype(PETSc.IntType))
 
