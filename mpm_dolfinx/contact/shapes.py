@@ -262,9 +262,10 @@ class Cone:
         return r * np.cos(beta) - z * np.sin(beta)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (m, d) of the distance; on the axis, the mean of the flank's normals."""
         beta = np.radians(self.angle_deg)
-        return self._polar(y)[2] * np.cos(beta) - self._axis * np.sin(beta)
+        z, r, away, _ = self._polar(y)
+        return away * (r > ROUNDED * np.abs(z))[:, None] * np.cos(beta) - self._axis * np.sin(beta)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""

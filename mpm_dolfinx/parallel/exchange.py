@@ -35,10 +35,7 @@ traffic = Traffic()
 
 @cache
 def _lasting(handle: int) -> PETSc.Vec:
-    """Return an object that keeps PETSc's duplicate of a communicator until the program ends.
-
-    At the end PETSc makes new duplicates, collectively.  A process without objects then waited for processes with some.
-    """
+    """Return an object that keeps PETSc's duplicate of a communicator; a new one at the end needs all processes."""
     return PETSc.Vec().create(MPI.Comm.f2py(handle))
 
 
