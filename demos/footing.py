@@ -466,7 +466,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
         ax.axhline(value, color="black", lw=0.8, ls="--")
         place = {"xytext": (0, -3), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
         ax.annotate(f"{name} limit at the surface: {value:.2f}", (depth[-1], value), **place)
-    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load against settlement, V = velocity · B / c_v")
+    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load; V = velocity · B / c_v")
     ax.set(xlim=(0, 1.02 * depth[-1]), ylim=(0, None))
     ax.legend(fontsize=8, loc="lower right", ncol=2)
     ax.grid(alpha=0.3)
