@@ -119,7 +119,7 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
         (at_rest, {"dt": -1}, "dt = -1, must be > 0 and finite"),
         (at_rest, {"progress": 1}, "progress = 1, must be True or False"),
         (lambda: block([CLAY], load=0.0), {}, "have no stress, must be in equilibrium under loads"),
-        (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength / 16, must slide at some factor"),
+        (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength divided by 16, must slide at some factor"),
         (
             lambda: column(cells=2, material=replace(CLAY, conductivity=1e-5)),
             {},

@@ -17,7 +17,7 @@ The plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
 The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d, Q / (M P) = sqrt(w) exp(-d/2).  On the
-yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
+yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, even at
 isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the

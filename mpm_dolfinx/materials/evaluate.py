@@ -214,11 +214,11 @@ finer cells by 3.0e-02.
 
 
 class SoftnessAtPoints:
-    """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
+    """Softness of yielding points: ratio of elastic to tangent shear modulus along the strain of the last step.
 
-    Volume strains that alternate from cell to cell grow with the strain.  Such a volume strain causes pressures of
-    volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.
-    tau must then grow with the softness, else the alternating pressures reach the soil's strength.
+    Volume strains that alternate from cell to cell grow with the strain.  Such a volume strain causes a pressure:
+    the strain divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau
+    must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
     modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the

@@ -25,7 +25,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress: to end Newton's method, and to accept a result
+EXACT, CLOSE = 1e-13, SAME  # stress error over largest initial stress: to end Newton's method, to accept a result
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 

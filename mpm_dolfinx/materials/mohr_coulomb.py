@@ -129,7 +129,7 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives by e (n, 3, 3), and flags (n,) of plastic flow.
+    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives d/de (n, 3, 3), and flags (n,) of plastic flow.
 
     e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,) of the law.
     """
@@ -191,7 +191,10 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses (n, 3), Pa, derivatives by trial stresses, and violations (n,); few: candidates."""
+        """Return final stresses (n, 3), Pa, their derivatives with respect to t (n, 3, 3), and `_violation` (n,), Pa.
+
+        few: the slice of `_faces` on which stresses may end; `ALL` includes the vertices.
+        """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:
@@ -212,7 +215,7 @@ class _Return:
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses on a face, or on the edge of two faces, with their derivatives and their violations."""
+        """Return stresses on a face, or on the edge of two faces, their derivatives and their violation: see `end`."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops

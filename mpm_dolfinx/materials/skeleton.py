@@ -436,14 +436,15 @@ class unsaturated:
     The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
     is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
-    steps of about (cell size)^2 / (coefficient of consolidation), in which a free surface crosses less than a cell.
+    steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.  In such a step a free
+    surface crosses less than a cell.
 
     Parameters
     ----------
     suction
         Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times (unit weight of water) (cell height).
     least
-        Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
+        Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
     specific_yield
         Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once (for steady flow).
     """

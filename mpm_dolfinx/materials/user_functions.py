@@ -63,7 +63,7 @@ def call(function: Callable, kind: str = "UFL", /, **available):
     names = list(signature(function).parameters)
     for name in names:
         if name not in available:
-            raise ValueError(f"{_name(function)}: argument {name!r}, must be some of {', '.join(available)}")
+            raise ValueError(f"{_name(function)}: argument {name!r}, must be one of {', '.join(available)}")
     given = {name: available[name] for name in names}
     return asked(_name(function), f"{kind} of {', '.join(names) or 'no argument'}", lambda: function(**given))
 

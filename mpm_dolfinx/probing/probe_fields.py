@@ -207,7 +207,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return indices of probes, offsets, heads (two-point flux) and weights of faces to cells outside the fit."""
+        """Return data of faces to cells outside the fit: probe index, offset, head by two-point flux, weight."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -228,7 +228,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return indices of probes, offsets, heads, weights of drained sides, and whether each is in the probe's cell.
+        """Return data of drained sides: probe index, offset, head, weight, and whether the side is in the probe's cell.
 
         For each side of a cell, the fit uses the mean head over the side's faces: single heads cause false gradients.
         """

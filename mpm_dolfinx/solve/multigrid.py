@@ -66,7 +66,7 @@ def multigrid_solver(
         Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
         interpolated by itself.
     held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies, as `places`; interpolated displacements vanish there.
+        Fixed degrees of freedom in cells of bodies, described like `places`; interpolated displacements vanish there.
     nodal
         Whether the unknowns belong to nodes.
     coarsest

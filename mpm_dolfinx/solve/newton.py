@@ -42,7 +42,7 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations cause volume changes
+INNER = 1e-3  # momentum tolerance over storage error; it is small because unconverged rotations change volumes
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
@@ -64,7 +64,7 @@ that rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 
 first step of a load that grows from zero; 0.26 e after a jump.  The largest error of a run is 0.7 to 5 times e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
+"""If a pressure's change in the second substep, over that in the first, is below this value, sdirk2 overshoots.
 
 With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
 sqrt(2). The changes there are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
 
-Given stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
+Initial stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
 pressures remove these forces. The steps add to the elastic strain of the points, and do not change their positions.
 """
 
@@ -52,12 +52,10 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Anderson mixing uses the last DEPTH iterations, until PATIENCE successive residuals are all above LESS times the
-best.
+"""Anderson mixing of `DEPTH` iterations ends when `PATIENCE` successive residuals exceed `LESS` times the best one.
 
 Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16, or 80
-and 24, the number of iterations is the same, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3
-remain.
+and 24, the number of iterations is the same, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3.
 """
 REMARKABLE = 0.05
 """Change of stress by balancing, divided by the largest given stress, above which there is a warning.
@@ -185,7 +183,7 @@ def _released(
     cut = start.on_grid.cut
 
     def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return a mask (nodes, d) of components along `axes`, at nodes of cells that contain faces of `some`."""
+        """Return a mask (nodes, d) of components along `axes`, at nodes of cells with faces of the surfaces `some`."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 

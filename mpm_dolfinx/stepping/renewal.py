@@ -96,7 +96,7 @@ class Renewal:
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask (n,) of `flowed` points that may be renewed: without probes, and not with kept pieces."""
+        """Return a mask (n,) of `flowed` points that may be renewed: they have no probes and do not keep pieces."""
         free = self.flowed(state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
@@ -190,7 +190,7 @@ class Renewal:
     def _signatures(
         self, surfaces: Sequence[Surface], held: Sequence[Surface]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return keys of outer faces, and the index of each face's set of conditions; -1: not to be renewed."""
+        """Return keys of outer faces, and the index of each face's set of conditions; -1 for faces that must stay."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)

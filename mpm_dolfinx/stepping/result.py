@@ -56,7 +56,7 @@ class Result:
     memory
         Peak memory of all processes with libraries, MB.
     imbalance
-        (Largest number on a process) / (mean) of points, pieces, cells at the end of the run, see `summary.imbalance`.
+        Largest number on a process divided by the mean, of points, pieces and cells at the end, see `imbalance`.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)

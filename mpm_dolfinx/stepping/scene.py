@@ -178,7 +178,7 @@ class Scene:
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
-            what = "gravity = %.6g m/s^2, but as gravity changes with time, conductivities become mobilities by the "
+            what = "gravity = %.6g m/s^2, but because gravity varies in time, conductivities become mobilities by the "
             what += "fluid's density x 9.81 m/s^2; their gravity must be given as Fluid(gravity=...)"
             warn(self.grid.comm, ConditionWarning, what, strength)
             self._warned.add("gravity")

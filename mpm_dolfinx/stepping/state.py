@@ -106,9 +106,10 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return changes (n, ...) in a time (s) by the polynomial through the last states; implicit: end rate x time.
+        """Return changes (n, ...) in a time (s) by the polynomial through the last states.
 
-        If first > 0, the implicit change in a first substep of this length (s), times seconds / first, is subtracted.
+        implicit: whether the rate at the end of the time replaces the mean rate.  If first > 0, the implicit change in
+        a first substep of this length (s), times seconds / first, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -144,8 +145,7 @@ class State:
         step of a stage. `reactions` (d,), N: of prescribed displacements. `wall_reactions` (d,), N: of the grid's
         walls. `outflows`, m^3/s (m^2/s in plane strain): through open sides, as volumes at zero pressure. `tool_forces`
         (d + 1,), in 3D (6,): forces, N, and moments, N m, of tools and contacts on the bodies. `tool_travel`, m:
-        displacement of a load-controlled tool in addition to a prescribed displacement. Other keys: user-defined
-        conditions.
+        displacement of a load-controlled tool beyond a prescribed displacement. Other keys: user-defined conditions.
     stage
         The present stage, with its conditions.
     begins

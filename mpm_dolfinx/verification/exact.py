@@ -80,7 +80,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
 
 
 def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
-    """Return the degree of consolidation: settlement since t = 0+ / final settlement since t = 0+.
+    """Return the degree of consolidation: settlement since t = 0+, divided by its final value.
 
     Parameters as for `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
     Returns (...), in (0, 1]. Source: Terzaghi (1923); Verruijt.
@@ -181,7 +181,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, Pa, and (integral of the pressure from 0 to x) / a, Pa, as one array (2, ...)."""
+        """Return the pressure, Pa, and its integral from 0 to x, divided by a, Pa, as one array (2, ...)."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
