@@ -78,9 +78,10 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma' H / c (n,), and settlement of the crest in each step / its mean in the first five (n,).
+    """Stability numbers gamma' H / c (n,), and settlement rates (n,) of the crest.
 
-    critical: the stability number at which the bank fails.
+    A rate is the settlement in a step, divided by its mean in the first five steps.  critical: the stability number at
+    which the bank fails.
     """
 
     cells: int

@@ -219,7 +219,7 @@ def test_one_line_says_what_is_wrong_with_a_law_in_numpy(solution, message):
         ({"update": lambda pressure: {}}, r"Wrong.update: returns \{\}, must have some of .*\{'crushed': \(\)\}"),
         ({"update": lambda pressure: {"crushed": np.zeros(3)}}, r"Wrong.update: crushed = array.* must be UFL"),
         ({"update": lambda pressure: {"crushed": 0.0}}, "Wrong.update: returns only numbers, must be UFL that depends"),
-        ({"trial": lambda F: {"volume": 3.0}}, "Wrong.trial: returns {'volume': 3.0}, must have some UFL of F"),
+        ({"trial": lambda F: {"volume": 3.0}}, "Wrong.trial: returns {'volume': 3.0}, must contain UFL of F"),
         ({"unknowns": {"pressure": np.nan}}, "Wrong: unknown 'pressure' = nan, must be numbers"),
         ({"unknowns": {"pressure": 0.0, "bulk": 0.0}}, "Wrong: the name 'bulk' is taken; parameters, state and"),
     ],

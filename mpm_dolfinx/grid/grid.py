@@ -72,7 +72,7 @@ def side(name: str, dim: int) -> tuple[int, int]:
 
 
 def in_chunks(count: int) -> list[slice]:
-    """Return consecutive slices of at most CHUNK rows; an empty list for no rows."""
+    """Return consecutive slices of at most `CHUNK` rows; an empty list for no rows."""
     return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
 
 

@@ -84,7 +84,7 @@ class ModifiedCamClay(Skeleton):
         Normal effective stresses at F = I, tension positive, mean < 0.  The last one is out of plane in 2D, and
         circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c / P_c of the yield surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
@@ -251,7 +251,7 @@ class BarcelonaBasic(ModifiedCamClay):
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c / P_c of the yield surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r

@@ -207,7 +207,7 @@ def mean_size(grid: Grid) -> float:
 
 
 MOST = 100.0
-"""Upper limit of the softness (elastic / tangent shear modulus), which is infinite in perfectly plastic flow.  Halving
+"""Upper limit of the softness, because softness is infinite in perfectly plastic flow.  Halving
 this value changes the result of scene "soil" in tests/plateaus.py by 4.0e-03 (relative), doubling it by 5.0e-03, and
 finer cells by 3.0e-02.
 """
@@ -250,7 +250,7 @@ class SoftnessAtPoints:
         self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
-        """Return the softness (n,), in [1, MOST], of the points `at`, data with F, parameters and state.
+        """Return the softness (n,), in [1, `MOST`], of the points `at`, data with F, parameters and state.
 
         dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): old softness.
         """

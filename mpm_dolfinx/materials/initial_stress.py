@@ -194,7 +194,7 @@ class InitialStresses:
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
             g = None if gravity is None else np.asarray(gravity).tolist()
-            raise ValueError(f"initial_stress: K0 with gravity = {g}, must point down along the last axis at the start")
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, gravity must point down, along the last axis")
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
             raise ValueError("initial_stress: K0 has neither gravity at the start nor surcharge, must have one of them")

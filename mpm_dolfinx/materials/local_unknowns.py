@@ -82,7 +82,7 @@ class LocalUnknowns:
         given = {"trial": trial}
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
         if not trial:
-            raise ValueError(f"{law.__name__}.trial: returns {line(given['trial'])}, must have some UFL of F")
+            raise ValueError(f"{law.__name__}.trial: returns {line(given['trial'])}, must contain UFL of F")
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()

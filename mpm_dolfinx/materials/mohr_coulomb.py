@@ -31,7 +31,7 @@ from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # candidates for the final stress in the list of `end`
-NEVER = 1e6  # largest tensile strength / bulk modulus
+NEVER = 1e6  # largest tensile strength, divided by the bulk modulus
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -326,7 +326,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether each component (m,) lags at u by at most 1 / sqrt(HOLD) of its prescribed increment."""
+        """Return whether each component (m,) lags at u by at most 1 / sqrt(`HOLD`) of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:

@@ -233,8 +233,8 @@ class HeldCells:
         penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
         counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
 
-        For each of k prescribed components: row: index of the penalty; axis; force, N; reached: whether the position is
-        reached.  told: indices of conditions that have been reported already, which are excluded.
+        For each of k prescribed components: row: index of the penalty; axis, force: its axis and force, N; reached:
+        whether it is at its position.  told: indices of conditions that have been reported already and are excluded.
         """
         grid = self.grid
         comm = grid.comm

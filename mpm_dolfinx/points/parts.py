@@ -28,7 +28,7 @@ class Parts:
     nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest value (count, ...) in each part, -inf if it has no values (n, ...); part (n,): part of each."""
+        """Return the largest of the values (n, ...) in each part (count, ...), or -inf; part (n,): their parts."""
         return largest_of_parts(comm, part, values, self.count)
 
 

@@ -42,7 +42,7 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 
 
 class _Lattice:
-    """Blocks of (2 CELLS + 1)^d cells around the cells of m probes.
+    """Blocks of (2 `CELLS` + 1)^d cells around the cells of m probes.
 
     number (m, cells): lexicographic indices of the cells, -1 outside the grid; midpoint, size (m, cells, d), m.
     middle: index of the probe's cell in its block; stride (d,): increment of this index along each axis.

@@ -45,7 +45,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""A pressure jumps if it changes by more than AGAIN times the rate in the first substep of the previous step."""
+"""A pressure jumps if it changes by more than `AGAIN` times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact; with more, a step times `SAME` is below the rounding of t."""
 RESOLVED = 10
@@ -284,7 +284,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     least = RESOLVED * scene.scheme.tolerance
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1), >= {RESOLVED} tolerance")
     if scene.numerics.method == "backward-euler":
-        raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, must be sdirk2")
+        raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, the method must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:

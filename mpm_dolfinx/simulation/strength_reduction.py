@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors, until bodies rest at one and slide at another; F is from 1 / `WIDEST` to `WIDEST`."""
+"""Ratio of successive trial factors, until bodies rest at one and slide at another; 1 / `WIDEST` <= F <= `WIDEST`."""
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
@@ -224,7 +224,7 @@ class _Weakened:
                 what = f"factor_of_safety: strength of {type(m).__name__} cannot be divided"
                 raise ValueError(f"{what}, must be a law with friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
-            raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
+            raise ValueError("factor_of_safety: no material has a strength, one must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: the scene has contacts, must have none")
         initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # has no data of the old grid

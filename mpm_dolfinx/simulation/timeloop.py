@@ -322,7 +322,7 @@ def _accepted(
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
     """Return a step towards the time `target`, s, and its end state; the step is reduced until it meets its tolerances.
 
-    verbose: warn of the first reduced step of a run.
+    verbose: whether to warn of the first reduced step of a run.
     """
     comm = simulation.scene.grid.comm
     preferred = whole = None

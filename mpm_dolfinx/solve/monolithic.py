@@ -227,7 +227,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if its rate in the last many / 4 iterations predicts more than `many`."""
+    """Return a monitor that ends a solve if its rate in the last `many` / 4 iterations predicts more than `many`."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

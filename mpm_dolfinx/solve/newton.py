@@ -166,7 +166,7 @@ def note_pressures(
 
     The difference between the step and a first-order step is the fluid volume seconds (Q2 - Q1). The fixed-stress
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
-    Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
+    Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
 
     seconds: factor, s, of the rates of the first substep; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
     function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
@@ -396,7 +396,8 @@ class Newton:
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Residuals within round-off are returned as 0; the history has their norms, with scales >= round-off / tolerance.
+        Residuals within round-off are returned as 0.  The history has their norms, with scales of at least the
+        round-off divided by the tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -526,5 +527,5 @@ class Newton:
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Return part / whole, nan where it is not finite."""
+    """Return the ratio of `part` to `whole`, nan where it is not finite."""
     return part / whole if whole and np.isfinite(part) else np.nan

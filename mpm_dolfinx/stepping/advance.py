@@ -190,7 +190,7 @@ class Motion:
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
         """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
 
-        They follow the trend, see `Trend.over`. If first > 0, the change in a first substep of this length (s), times
+        They follow the trend, see `Trend.over`. If `first` > 0, the change in a first substep of this length (s), times
         seconds / first, is added. Domains move affinely. A cell takes the volume mean of its pieces, a node that of its
         cells. Ten load steps of a drained beam take 50 Newton steps from rest, 29 from this guess.
         """
@@ -349,7 +349,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected corners of yielded domains, except if keeps (n,)."""
+        """Return the points after `with_volumes` has corrected corners of yielded domains, except `keeps` (n,)."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -379,7 +379,7 @@ class Motion:
 
         The step adds to the defect the increase of the fluid content, due to volume and cell pressures, minus the net
         inflow, divided by alpha.  Both are fluid masses divided by the density at zero pressure. Soil with a free
-        surface has no defect, because its content excludes drained water. Points with keeps (n,) have no correction.
+        surface has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut

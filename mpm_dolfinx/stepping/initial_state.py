@@ -58,14 +58,14 @@ Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of the
 and 24, the number of iterations is the same, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Change of stress by balancing, divided by the largest given stress, above which there is a warning.
+"""Change of stress by balancing, divided by the largest initial stress, above which there is a warning.
 
 The value is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene in its first stage, with given stresses that are not balanced yet."""
+    """Return the state of a scene in its first stage, with initial stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     first = _stage(scene, conditions, present, later)

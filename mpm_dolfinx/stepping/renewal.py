@@ -300,7 +300,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the points where kept (n,) is true, together with the new points `made`."""
+    """Return the points where `kept` (n,) is true, together with the new points `made`."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 

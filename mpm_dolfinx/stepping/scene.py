@@ -217,7 +217,7 @@ class Scene:
         """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and followed_tool(self.grid, first.given) is None:
-            raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be in its conditions")
+            raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
 
     def followed(self, state: State) -> State:
         """Return the state for its next step, and move the grid to the lines of that step."""

@@ -108,7 +108,7 @@ class Trend:
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
         """Return changes (n, ...) in a time (s) by the polynomial through the last states.
 
-        implicit: whether the rate at the end of the time replaces the mean rate.  If first > 0, the implicit change in
+        implicit: whether the rate at the end of the time replaces its mean.  If `first` > 0, the implicit change in
         a first substep of this length (s), times seconds / first, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
@@ -186,7 +186,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
+            raise ValueError("state: true positions of points, must be relative to the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property

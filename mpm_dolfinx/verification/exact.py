@@ -43,7 +43,7 @@ def _within(name: str, value: ArrayLike, upper: float) -> Array:
 
 
 def _by_time(short, long, T: ArrayLike) -> Array:
-    """Return short(T) where T < SWITCH, else long(T); each function is evaluated only in its own range of T."""
+    """Return short(T) where T < `SWITCH`, else long(T); each function is evaluated only in its own range of T."""
     T = np.asarray(T)
     return np.where(T < SWITCH, short(np.minimum(T, SWITCH)), long(np.maximum(T, SWITCH)))[()]
 
@@ -151,7 +151,7 @@ class Mandel:
 
     @cached_property
     def roots(self) -> Array:
-        """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), (TERMS,)."""
+        """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), an array (`TERMS`,)."""
         n = np.arange(TERMS) * np.pi
         r = n + np.pi / 2
         for _ in range(50):  # Newton's method is monotone for a convex function from its positive side
