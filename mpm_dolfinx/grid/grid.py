@@ -640,7 +640,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which x, from the base, are outside the grid by more than `tolerance` cell sizes plus rounding."""
+        """Return which positions x, from the base, are outside the grid by more than `tolerance` cells and rounding."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)

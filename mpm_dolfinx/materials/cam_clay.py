@@ -186,7 +186,7 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def update(trial, shear, M, lambda_, kappa, pressure, yield_pressure, plastic, consolidated, steeper):
-        """Return the state at the end of the step, name -> UFL."""
+        """Return the state at the end of the step: UFL by name."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         strain = trial["strain"]
         a = to.compaction

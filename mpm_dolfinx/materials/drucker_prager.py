@@ -109,7 +109,7 @@ class DruckerPrager(Frictional):
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
-        """Return the state at the end of the step, name -> UFL."""
+        """Return the state at the end of the step: UFL by name."""
         trial = Trial(F, plastic)
         to = returned(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}

@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of a cell, in uneven grids of the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell, on uneven grids of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 

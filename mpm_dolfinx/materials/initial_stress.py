@@ -367,7 +367,7 @@ def _kappa(m) -> NDArray[np.float64]:
 
 
 def _friction(m) -> NDArray[np.float64]:
-    """Return the friction angle, degrees, nan for laws without one."""
+    """Return the friction angle, degrees; nan for laws without friction."""
     return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
 
 

@@ -118,7 +118,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def update(trial, bulk, shear, plastic, stress, flows):
-        """Return the state at the end of the step, name -> UFL."""
+        """Return the state at the end of the step: UFL by name."""
         (F, plane) = trial["F"]
         tau = symmetric(stress)
         I = ufl.Identity(3)

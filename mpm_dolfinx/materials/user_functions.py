@@ -106,7 +106,7 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict that a user-defined function gave, as UFL with the given shapes; some: names may be missing.
+    """Return the dict from a user-defined function as UFL with the given shapes; some: whether names may be missing.
 
     Raises
     ------

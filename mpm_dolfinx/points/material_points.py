@@ -110,7 +110,7 @@ class MaterialPoints:
         Corners at zero displacement: as seeded, or at the last time a stage set displacements to zero.
     reference : (n, 2^d, d), m
         Corners of the domain in the reference configuration of F: as seeded, or as re-initialised.
-    data : name -> (n, ...)
+    data : (n, ...) by name
         Further data of the points: parameters that vary with position, state of the law.
     """
 

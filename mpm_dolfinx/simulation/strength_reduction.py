@@ -285,7 +285,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the work of the viscous stress in a step, divided by the integral of |deviatoric stress| |strain|.
+        """Return a step's viscous work, divided by the integral of the norm of deviatoric stress times that of strain.
 
         Points that moved to another process are excluded.
         """

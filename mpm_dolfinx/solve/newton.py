@@ -164,7 +164,7 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The difference between the step and a first-order step is the fluid volume seconds (Q2 - Q1). The fixed-stress
+    The difference between the step and a first-order step is the fluid volume `seconds` (Q2 - Q1). The fixed-stress
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
 

@@ -188,7 +188,7 @@ class Motion:
         return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
-        """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
+        """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after `seconds` (s).
 
         They follow the trend, see `Trend.over`. If `first` > 0, the change in a first substep of this length (s), times
         seconds / first, is added. Domains move affinely. A cell takes the volume mean of its pieces, a node that of its
@@ -267,7 +267,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F of the points after a step: (n, 3, 3), or (n, 2, 2) if this suffices for the laws.
 
-        F is the mean of (increment of F) F_n over the pieces of the point, scaled so that det F is the mean of theirs.
+        F is the mean of (increment of F) F_n over the pieces of the point, scaled so that det F is their mean det F.
         """
         pieces = data.pieces
         grid = cut.grid

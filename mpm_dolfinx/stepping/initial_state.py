@@ -170,9 +170,9 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and tractions on quiet sides.
 
-    The tractions are a dict: name of the point data -> ids (m,) of points on a side, and their tractions (m, d), Pa.
-    The stresses are in equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
-    after: the new stage.
+    The tractions are a dict: for each name of point data, ids (n,) of points on a side, and tractions (n, d), Pa,
+    there. The stresses are in equilibrium with these tractions, the loads of the previous stage, and the remaining
+    supports. after: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -276,7 +276,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return the points with added bodies, and those of added bodies alone; first bodies that touch placed bodies."""
+    """Return all points with added bodies, and the points of added bodies; bodies that touch others are added first."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))

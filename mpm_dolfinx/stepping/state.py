@@ -145,7 +145,7 @@ class State:
         step of a stage. `reactions` (d,), N: of prescribed displacements. `wall_reactions` (d,), N: of the grid's
         walls. `outflows`, m^3/s (m^2/s in plane strain): through open sides, as volumes at zero pressure. `tool_forces`
         (d + 1,), in 3D (6,): forces, N, and moments, N m, of tools and contacts on the bodies. `tool_travel`, m:
-        displacement of a load-controlled tool beyond a prescribed displacement. Other keys: user-defined conditions.
+        displacement of a load-controlled tool, added to a prescribed one. Other keys: user-defined conditions.
     stage
         The present stage, with its conditions.
     begins
@@ -196,7 +196,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions at which the next step cuts them; with kept pieces, at those of the last reset."""
+        """Points at the positions at which the next step cuts them; if they keep their pieces, at the last reset."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
