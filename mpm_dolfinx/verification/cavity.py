@@ -25,7 +25,7 @@ CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newt
 
 
 class _Rings:
-    """A law at n rings.  Stretches (n, 2) are radial and hoop; a state is name -> (n, ...); `start`: initial state."""
+    """A law at n rings.  Stretches (n, 2): radial and hoop; state: values (n, ...) by name; `start`: initial state."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
