@@ -105,7 +105,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the range (n,) and the value (n,) of each integer in m ranges from `first` on, of `count` integers."""
+    """Return each integer's range (n,) and value (n,), for m ranges that begin at `first` and have `count` integers."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 

@@ -270,7 +270,7 @@ class _Equations:
         Raises
         ------
         ValueError
-            The result is no dict of pairs with names and shapes of the unknowns, or there is another derivative.
+            The result is no dict of pairs with names and shapes of the unknowns, or names an unknown trial value.
         """
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():

@@ -98,7 +98,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow, else 0."""
+        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow (else 0)."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -227,7 +227,7 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses t at a vertex, zero derivatives and the violation; conditions: such as `_in_apex`."""
+        """Return stresses t at a vertex, zero derivatives and the violation; conditions: function, as `_in_apex`."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]

@@ -50,7 +50,7 @@ class Skeleton:
     Parameters
     ----------
     bulk
-        Drained bulk modulus K, Pa, > 0 (3D modulus, also in plane strain).
+        Drained bulk modulus K, Pa, > 0 (3D modulus, even in plane strain).
     shear
         Shear modulus G, Pa, > 0.
     porosity

@@ -496,7 +496,7 @@ def cut_faces(
     A face across a grid line must load the nodes on both sides in proportion to its parts. With one point per face, the
     error would move nodes of partly filled cells in every step without limit.
 
-    corners (m, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (m, 2^(d-1), e):
+    corners (faces, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (faces, 2^(d-1), e):
     coordinates of the corners, to be interpolated.
 
     Returns

@@ -3,7 +3,7 @@
 
 There are four methods for the linearised problem. Without fluid the momentum balance is solved alone. With fluid the
 displacements are eliminated (`schur`), or both balances are solved together (`monolithic`) or in turn (fixed-stress
-iterations). The solver for displacements is direct (PETSc, also with a block for each node, or MUMPS) or multigrid.
+iterations). The solver for displacements is direct (PETSc, with or without nodal blocks, or MUMPS) or multigrid.
 """
 
 from __future__ import annotations

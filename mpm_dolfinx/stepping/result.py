@@ -56,7 +56,7 @@ class Result:
     memory
         Peak memory of all processes with libraries, MB.
     imbalance
-        Largest number on a process divided by the mean, of points, pieces and cells at the end, see `imbalance`.
+        Largest number on a process divided by the mean, of points, pieces and cells: `summary.imbalance` at the end.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)

@@ -249,7 +249,7 @@ class Scene:
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
 
-        renew: whether renewal is allowed. A state in which all points keep their pieces is returned as it is.
+        renew: whether renewal is allowed. A state in which all points keep their pieces is unchanged.
         """
         if state.stays:
             return state, 0

@@ -154,7 +154,7 @@ class State:
         Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
         or contact. None before the first step, and without yield or contact.
     trend
-        Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after new bodies.
+        Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after bodies were added.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
         forces, after a new stage, and after a reset of the grid.

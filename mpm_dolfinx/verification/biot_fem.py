@@ -533,7 +533,7 @@ class BiotFEM:
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
-        """Solve by single Newton steps with limited pressure changes, see `retention.restrained`; return as `_free`.
+        """Solve by single Newton steps with limited pressure changes, see `retention.restrained`; result: see `_free`.
 
         The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990), as do tangents after a limited
         step and after an increase of the residual.  With gravity and dry soil this derivative can reverse the step.

@@ -205,7 +205,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
     Parameters
     ----------
     t : (...), s, > 0; time
-    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3), as fluid and grains are incompressible
+    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3), because fluid and grains are incompressible
     nu : in (-1, 0.5); drained Poisson ratio
     p0 : Pa; uniform pressure on the surface, equal to the pore pressure at t = 0+
 
@@ -238,8 +238,8 @@ def _cryer_long(mu: float, T: Array) -> Array:
 class SelfWeightColumn:
     """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
-    Without lateral stretch, the Cauchy and the first Piola-Kirchhoff stress along the column are both
-    tau / stretch, and balance the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
+    Without lateral stretch, the Cauchy and the first Piola-Kirchhoff stress along the column are equal: tau divided by
+    the stretch.  They balance the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
 
     Parameters
     ----------
