@@ -98,7 +98,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow (else 0)."""
+        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow or 0."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2

@@ -23,9 +23,9 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
     """Return the sums over the pieces of one part in each cell that `OfSuction` needs; None if it needs none.
 
     points: integration points of the pieces; locks: whether their law uses the mean dilatation; F: deformation gradient
-    (d, d), a UFL variable; slopes: derivatives with respect to the pressure, as UFL, of the first Piola-Kirchhoff
-    stress (d, d) and, with mean dilatation, of the mean stress pi conjugate to theta.  `slopes` are empty if the law is
-    independent of suction.
+    (d, d), a UFL variable; slopes: UFL derivatives of stresses with respect to the pressure, empty for laws without
+    suction.  The stresses are the first Piola-Kirchhoff stress (d, d) and, with mean dilatation, the mean stress pi
+    conjugate to theta.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []

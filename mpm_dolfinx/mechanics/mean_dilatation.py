@@ -15,9 +15,9 @@ the derivative
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
 At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives with
-respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in the
-material point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points store
-Fbar.  The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
+respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et al. (2018) used
+incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points
+store Fbar.  The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
 from __future__ import annotations
