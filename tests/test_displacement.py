@@ -67,5 +67,5 @@ def test_given_displacements_hold_a_body_that_no_wall_holds():
 
 
 def test_components_are_checked():
-    with pytest.raises(ValueError, match="components must be some of 'xy'"):
+    with pytest.raises(ValueError, match="components must be letters of 'xy'"):
         column(fluid=False, conditions=[mpm.Displacement("top", (0, 0), "z")])

@@ -76,7 +76,7 @@ class Tool:
     shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
         The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Displacement from the initial position, also in later stages.  In axisymmetry: along the axis.
+        Displacement from the initial position, even in later stages.  In axisymmetry: along the axis.
     rotation_rad : float or callable t (s) -> float, rad
         Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
     centre : (d,), m
@@ -102,8 +102,8 @@ class Tool:
         Initial velocity of a free tool.
     moment
         Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
-        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, do not rotate without a given
-        value.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, rotate only if `moment` is
+        specified.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
@@ -169,7 +169,7 @@ class Tool:
             numbers("Tool: moment", self.moment, test=lambda v: v > 0, allowed="> 0, or infinity")
         if callable(self.displacement) or callable(self.rotation_rad):
             raise ValueError(
-                f"{line(self)}: a free tool moves by itself, displacement and rotation_rad must be constant"
+                f"{line(self)}: forces move a free tool, so displacement and rotation_rad must be constant"
             )
 
     @property
