@@ -319,8 +319,8 @@ class Rain(Flux):
     Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates at the
     prescribed rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.
     `outflows` of the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s
-    (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")`: outflow through
-    all open sides; `outcome("ran_off")`: run-off and seepage on this side; `outcome("ponded")`: ponded water.
+    (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")` is
+    outflow through all open sides, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
 
     Parameters
     ----------
