@@ -277,9 +277,9 @@ def test_what_are_no_contacts_is_refused():
         scene(boxes[:2], mpm.Contact(0, 1), numerics=mpm.Numerics(quadrature="point"))
     with pytest.raises(ValueError, match=r"terms: not available with contacts, must be absent"):
         scene(boxes[:2], mpm.Contact(0, 1), terms=[lambda at: 0])
-    with pytest.raises(ValueError, match=r"is free to move as a rigid body in 1 of 3 ways"):
+    with pytest.raises(ValueError, match=r"is free to move as a rigid body in 1 of 3 modes"):
         scene(boxes[:2], mpm.Contact(0, 1), gravity=[0, -10]).step(1.0)  # slides
-    with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
+    with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 modes"):
         scene(boxes[::2], mpm.Contact(0, 1, friction=0.3), gravity=[0, -10]).step(1.0)
     sand = mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=5e3)
     s = mpm.Simulation(

@@ -89,7 +89,7 @@ class Body:
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face at the lower (0) or upper (1) `end` of an axis, and faces (m,).
+        """Return domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face indices (m,).
 
         In unstructured bodies, these are the surface faces whose outward unit normal has its largest component along
         this direction, if this component exceeds `least`.

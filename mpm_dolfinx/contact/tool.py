@@ -281,7 +281,7 @@ class Tool:
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), with rotation, rad."""
+        """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), m, and rotation, rad."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")

@@ -188,8 +188,8 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
 
-        Conductivities change by decades in a step, so the correction must be proportional to the flux.  Limits keep
-        the correction from emptying the soil.
+        Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
+        Limits keep the correction from emptying the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)

@@ -267,7 +267,7 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Form of the fluxes by p and the fluid's weight between cells of the same soil; None without weight."""
+        """Form of the fluxes due to p and the fluid's weight between cells of one soil; None without weight."""
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
