@@ -10,7 +10,7 @@ overfill.  After a step the corners of yielded domains therefore move by the d t
 
 V_p is the volume of a point and V that of its domain; the mean is over the domain's corners; h are edges of cells.
 Both sums are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of
-elastic domains and held corners stay.  Kugelstadt et al. (2019) correct densities of cells in this way.
+elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 
 from __future__ import annotations
