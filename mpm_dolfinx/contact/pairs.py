@@ -134,7 +134,7 @@ class FacePairs(Pairs):
     place: NDArray[np.int64]  # identifier of the point, the same in all updates of the pairs in a step (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`.  Moments refer to the positions at the start of the step."""
+        """See `Pairs`.  Lever arms are those at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 

@@ -197,8 +197,7 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        law = self.now.law
-        state = self.now.state
+        law, _, state, _ = self.now
         of = self.pairs.number
         at = law.pairs.at(w, motion)
         touch = law.touch(state, at)
@@ -245,10 +244,9 @@ class ContactProblem(Loads):
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
-        found = self.found(at)
+        where, touch, *_ = found = self.found(at)
         law = self.now.law
         unknowns = at.unknowns
-        where, touch, *_ = found
         B, _ = self._B(law, unknowns)
         K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
         if not self.pushed:
@@ -301,9 +299,8 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return displacements (tools,), m, at which one point would bear the load (or inf), and which tools touch."""
-        law = self.now.law
-        state = self.now.state
+        """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
+        law, _, state, _ = self.now
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -351,8 +348,7 @@ class ContactProblem(Loads):
         If penetrations are small enough, move tools whose reaction differs from the load.
         """
         found = self.found(at)
-        law = self.now.law
-        state = self.now.state
+        law, _, state, _ = self.now
         part = at.parts.cells[law.cell]
         new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
@@ -397,8 +393,7 @@ class ContactProblem(Loads):
         Pairs that are open before and after the update are ignored, as are parts after `FOLLOWS` updates.
         """
         found = self.found(at)
-        law = self.now.law
-        state = self.now.state
+        law, _, state, _ = self.now
         pairs = new.law.pairs
         gap = np.einsum("md,md->m", pairs.n, pairs.offset)
         pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
@@ -452,6 +447,8 @@ class ContactProblem(Loads):
         """See `Loads`: forces, N, and moments, N m, on the bodies (3,), in 3D (6,); displacements due to loads, m."""
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
+        if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
+            where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
         if self.pushes is not None:
             out["tool_travel"] = dict(zip(names, self.pushes.start + motion, strict=True))

@@ -101,7 +101,7 @@ class Tools(Touching):
     def masses(self) -> NDArray[np.float64]:
         """Masses, kg, and moments of inertia, kg m^2, of free tools (tools, q); 0 for other tools."""
         d = self.grid.dim
-        out = np.array([np.full(motion_count(d), tool.mass or 0.0) for tool in self.tools])
+        out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
             if tool.rotates(d):
                 row[d:] = tool.inertia(d)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -245,9 +246,9 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return the conditions with the scene's contacts, which stages cannot change."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
-    if given and given != standing:
+    if given and str([vars(one) for one in given]) != str([vars(one) for one in standing]):
         raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
-    return [*conditions, *(() if given else standing)]
+    return [*(one for one in conditions if one not in given), *standing]
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
@@ -310,6 +311,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
     """Return the points with new values of the data named in `fields`."""
     instance("stage: fields", fields, Mapping)
     data = dict(points.data)
+    comm = scene.grid.comm
     for name, value in fields.items():
         if name not in data and name in scene.materials.constants:
             law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
@@ -319,11 +321,12 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
         if name in data and new.shape == data[name].shape[1:]:
             new = np.broadcast_to(new, data[name].shape)
         if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
-            each = "one value for all, or " if name in data else ""
+            each = "one value for all, or " if name in data else f"one of {', '.join(data)}, or new data with "
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+        if name not in data and (close := get_close_matches(name, data)):
+            warn(comm, ConditionWarning, "%s: new data that no law reads; is %r meant?", what, close[0])
         data[name] = new.copy()
-    points = replace(points, data=data)
-    return everywhere(scene.grid.comm, lambda: scene.materials.changed("stage: fields", points, fields))
+    return everywhere(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
