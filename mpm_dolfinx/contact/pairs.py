@@ -30,7 +30,7 @@ class Geometry(NamedTuple):
     """Geometry of m contact pairs at relative displacements w (m, d), m."""
 
     gap: NDArray[np.float64]  # gap (m,), m; negative in penetration
-    n: NDArray[np.float64]  # derivative of the gap by w (m, d): the outward unit normal of the other side
+    n: NDArray[np.float64]  # derivative of the gap with respect to w (m, d): outward unit normal of the other side
     curvature: NDArray[np.float64] | None  # second derivative of the gap (m, d, d), 1/m; None if zero
     slip: NDArray[np.float64]  # slip in the step (m, d), m
     arm: NDArray[np.float64]  # lever arm for moments (m, d), m

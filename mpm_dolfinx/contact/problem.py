@@ -2,14 +2,14 @@
 """Contact problem of a substep, with tools or between groups of bodies.
 
 A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
-With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
+The pairs have the relative displacements w = B u and the forces f(w); the nodal forces are B^T f(w).  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
 at the start of the step.  After convergence, pairs, normals and gaps are updated at the new positions, and the step is
 solved again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
-together with the equilibrium of the bodies, by
+the forces on points, let D be minus their derivative with respect to w, and let s = e . D e.  Newton's method solves
+e . f = load together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
@@ -45,9 +45,9 @@ FOLLOWS = 8  # largest number of updates of the pairs in a step
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """Loads of k load-controlled tools."""
+    """Prescribed loads on k load-controlled tools."""
 
-    names: Sequence[str]  # of the tools, for error messages
+    names: Sequence[str]  # names of the tools, for error messages
     start: NDArray[np.float64]  # displacement by the load before the step (k,), m
     direction: NDArray[np.float64]  # unit vector of the load (k, d)
     load: NDArray[np.float64]  # load (k,), N; nan for tools without a load
@@ -64,7 +64,7 @@ class LinearMotion:
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
     shift: NDArray[np.float64]  # Newton increment of `motion` (k,), m
-    slope: NDArray[np.float64]  # derivative by the relative displacements of each pair (m, d)
+    slope: NDArray[np.float64]  # derivative with respect to the relative displacements of each pair (m, d)
 
 
 class Found(NamedTuple):
@@ -94,7 +94,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of one kind in a stage; given: its tools, or its contacts between groups, by name."""
+    """Contact conditions of one kind in a stage.  `given` are its tools, or its contacts between groups, by name."""
 
     linear = False
 
@@ -125,11 +125,11 @@ class ContactProblem(Loads):
     law, origin
         Contact law at the start of the step, and the material points of its pairs.
     pushes
-        Loads of tools.
+        Prescribed loads on the tools.
     again
         Function from displacements (a local array, m) to law and origin of the pairs found there, see `FacePairs`.
     cell_pairs
-        Function that returns all pairs of cells, as first * cells + second, that contact pairs may join in the step.
+        Function that returns all pairs of cells, as integers first * cells + second, that contact pairs may join.
     """
 
     linear, smooth, touches = False, False, True
@@ -301,7 +301,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
+        """Return displacements (tools,), m, at which one point would bear the load (or inf), and which tools touch."""
         law = self.now.law
         state = self.now.state
         of = self.pairs.number
@@ -381,7 +381,7 @@ class ContactProblem(Loads):
         if self._again is None:
             return False
         new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
-        if late.any():  # in these parts alone are pairs replaced
+        if late.any():  # pairs are replaced in these connected parts only
             both = self.now, new
             chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
             kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
@@ -488,7 +488,7 @@ class ContactProblem(Loads):
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Return the rows of two pairs or states that `kept` flags, as one object, sorted by the indices `order`."""
+    """Merge two objects, both `Pairs` or both `ContactState`: keep the rows flagged in `kept`, in the order `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

@@ -27,18 +27,18 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap / cell size between faces of two domains that still count as one surface.  Halving this value changes the
-result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
-"""
+"""Largest gap between faces of two domains that count as one surface, divided by the cell size.  Halving this value
+changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
+finer cells by 9.0e-02."""
 CRUMB = NEAR
-"""Area of a part / area of its cell, below which the part is dropped; others receive its mass.  Source: as `NEAR`."""
+"""Area of a part, divided by the area of its cell, below which other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Area of a part / area of its cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
+"""Area of a part in cell areas.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
 Source: definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell.
 """
 COVERED = 0.25
-"""Largest difference (area of pieces) - (filled area) in a cell / cell area.  Source: definition, one domain."""
+"""Largest difference between the pieces' area and the filled area, in cell areas.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
