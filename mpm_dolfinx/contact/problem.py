@@ -304,7 +304,7 @@ class ContactProblem(Loads):
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
+            far = found.at.gap - law.multiplier(state) / k + self.pushes.load[of] / (k * self.pairs.area * along)
             far = np.where(along > 0, far / along, np.inf)
         nearest = np.full(len(self.pushes.load), np.inf)
         np.minimum.at(nearest, of, far)
@@ -382,7 +382,7 @@ class ContactProblem(Loads):
             chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
             kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
             origin, order = joined([of.origin for of in both], kept)
-            law = ContactLaw(new.law.names, new.law.contacts, _merged([of.law.pairs for of in both], kept, order))
+            law = new.law.on(_merged([of.law.pairs for of in both], kept, order), origin)
             order = np.argsort(np.concatenate([of.law.key[rows] for rows, of in zip(chosen, both, strict=True)]))
             self.now = Current(law, origin, _merged([of.state for of in both], chosen, order))
         return bool(late.any())
@@ -395,14 +395,16 @@ class ContactProblem(Loads):
         found = self.found(at)
         law, _, state, _ = self.now
         pairs = new.law.pairs
-        gap = np.einsum("md,md->m", pairs.n, pairs.offset)
+        gap = pairs.gap_before()
         pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
-        now = ContactLaw(law.names, law.contacts, pairs)
+        now = law.on(pairs, new.origin)
         fresh = now.begins()
         _, new_at, old_at = np.intersect1d(now.key, law.key, return_indices=True)
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
             values[new_at] = getattr(state, name)[old_at]
+        if law.inertia:
+            carried["pressure"][new_at] += now.start[new_at] - law.start[old_at]
         of_old, of_new = at.parts.cells[law.cell], at.parts.cells[now.cell]
         updates = at.parts.largest(self.grid.comm, of_old, state.updates)
         updates = np.where(updates < 0, BEGIN, updates)
