@@ -197,7 +197,7 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        law, _, state, _ = self.now
+        law, state = self.now.law, self.now.state
         of = self.pairs.number
         at = law.pairs.at(w, motion)
         touch = law.touch(state, at)
@@ -300,7 +300,7 @@ class ContactProblem(Loads):
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
-        law, _, state, _ = self.now
+        law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -348,7 +348,7 @@ class ContactProblem(Loads):
         If penetrations are small enough, move tools whose reaction differs from the load.
         """
         found = self.found(at)
-        law, _, state, _ = self.now
+        law, state = self.now.law, self.now.state
         part = at.parts.cells[law.cell]
         new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
@@ -393,7 +393,7 @@ class ContactProblem(Loads):
         Pairs that are open before and after the update are ignored, as are parts after `FOLLOWS` updates.
         """
         found = self.found(at)
-        law, _, state, _ = self.now
+        law, state = self.now.law, self.now.state
         pairs = new.law.pairs
         gap = pairs.gap_before()
         pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
