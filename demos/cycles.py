@@ -143,9 +143,9 @@ def cycle(
 
 
 def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = None) -> float:
-    """Return rms change / rms of the total stress in the middle of the stretched block, by a rotation of 360 degrees.
+    """Return the rms change of the total stress in the middle of the stretched block, divided by the rms stress.
 
-    With a fluid the block is undrained.
+    The change is due to a rotation by 360 degrees.  With a fluid the block is undrained.
     """
     cells = round(1.8 * BLOCK / h)
     grid = mpm.Grid([0] * 2, [cells * h] * 2, [cells] * 2)
