@@ -391,7 +391,7 @@ def draw(o: Namespace, examples: list[Example]) -> None:
         ax.locator_params(nbins=4)
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
-    fig.suptitle("User-defined physics: largest error of each example")
+    fig.suptitle("User-defined physics: largest relative error of each example")
     common.save(fig, o.out / "extending_with_ufl.png")
 
 

@@ -433,7 +433,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
             surface.plot(sign * x, y, color=colour, lw=1.2, label=f"{name} push" if sign > 0 else None)
     block(surface, run.at_end)
     surface.set(xlim=(-4 * WIDTH, 4 * WIDTH), ylim=(None, 0.7), aspect="auto", ylabel="y / B (-)")
-    surface.set_title("The soil's surface at the end of the push")
+    surface.set_title("Surface at the end of the push")
     surface.legend(fontsize=8, loc="upper left", ncol=3)
     for (how, cells), each in stiff.items():
         fine = cells == max(c for _, c in stiff)
@@ -445,7 +445,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
         label = f"{how}, {cells} cells over the width: {each.load[-1] - 1:+.1%}"
         limit.plot(np.array(each.settlement) / each.settlement[-1], each.load, label=label, **style)
     limit.axhline(1, color="black", lw=0.8, ls=":")
-    limit.set(xlabel="settlement / that at the end (-)", ylabel="load / theory (-)", xlim=(0, 1), ylim=(0, 1.15))
+    limit.set(xlabel="settlement / final settlement (-)", ylabel="load / theory (-)", xlim=(0, 1), ylim=(0, 1.15))
     limit.set_title("Very stiff soil: load / theoretical limit load")
     limit.legend(fontsize=8, loc="lower right")
     limit.grid(alpha=0.3)
@@ -466,7 +466,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
         ax.axhline(value, color="black", lw=0.8, ls="--")
         place = {"xytext": (0, -3), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
         ax.annotate(f"{name} limit at the surface: {value:.2f}", (depth[-1], value), **place)
-    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load and settlement; V = velocity · B / c_v")
+    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load; V = velocity · B / c_v")
     ax.set(xlim=(0, 1.02 * depth[-1]), ylim=(0, None))
     ax.legend(fontsize=8, loc="lower right", ncol=2)
     ax.grid(alpha=0.3)

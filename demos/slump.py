@@ -354,7 +354,7 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
         (line,) = ax.semilogy(f.number, f.rate, ".-", label=f"{f.cells} cells over the height")
         ax.plot(f.critical, RUNAWAY, "o", mfc="none", ms=9, color=line.get_color(), label=f"fails at {f.critical:.2f}")
     ax.axvline(THEORY, color="black", lw=1, ls="--", label=f"limit analysis: {THEORY}")
-    ax.set(xlabel=r"$\gamma' H / c$ (-)", ylabel="settlement in a step / that at the start (-)")
+    ax.set(xlabel=r"$\gamma' H / c$ (-)", ylabel="settlement per step / first step (-)")
     ax.set_title("Undrained, without friction: the strength falls by 1 % in each step", fontsize=11)
     ax.grid(alpha=0.3)
     ax.legend()

@@ -197,6 +197,18 @@ def test_the_contact_bears_what_is_on_it_as_bodies_come_and_go(wet):
     assert not wet or s.result.balance < 1e-8
 
 
+def test_moments_of_a_rough_plate_and_of_a_contact_on_a_block_sum_to_zero():
+    grid = mpm.Grid([0, 0], [1, 1.5], [10, 15])
+    bodies = [mpm.box(grid, [0.1, 0], [0.9, 0.5]), mpm.box(grid, [0.25, 0.5], [0.75, 1])]
+    to = (0.01, -0.02)  # m
+    lid = mpm.Tool(mpm.HalfSpace((0, 1), (0, -1)), lambda t: np.multiply(t, to), friction=0.6, name="lid")
+    conditions = [mpm.Contact(1, 0, friction=0.4, name="on"), lid]
+    s = mpm.Simulation(grid, bodies, [SOIL], walls={"bottom": "xy"}, conditions=conditions)
+    s.run(1, 1, progress=False)
+    x, y, about_lid = s.tool_forces["lid"]
+    assert s.tool_forces["on"] == pytest.approx([-x, -y, -(about_lid + to[0] * y - to[1] * x)], rel=1e-6)
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_plate_presses_bodies_of_two_groups_evenly(order):
     """The bodies stand side by side, with different spacings; both recover elastically, and the plate parts."""

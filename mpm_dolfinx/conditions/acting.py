@@ -316,6 +316,11 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements: (condition, faces, prescribed axes)."""
 
+    @property
+    def seeded(self) -> list[Surface]:
+        """Faces whose displacement from the seeded position a condition needs; renewal leaves their domains."""
+        return [faces for _, faces, _ in self.held]
+
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
         raise NotImplementedError

@@ -197,8 +197,7 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         of = self.pairs.number
         at = law.pairs.at(w, motion)
         touch = law.touch(state, at)
@@ -245,10 +244,9 @@ class ContactProblem(Loads):
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
-        found = self.found(at)
+        where, touch, *_ = found = self.found(at)
         law = self.now.law
         unknowns = at.unknowns
-        where, touch, *_ = found
         B, _ = self._B(law, unknowns)
         K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
         if not self.pushed:
@@ -301,13 +299,12 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return displacements (tools,), m, at which one point would bear the load (or inf), and which tools touch."""
-        law = self.now.law
-        state = self.now.state
+        """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
+        law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
+            far = found.at.gap - law.multiplier(state) / k + self.pushes.load[of] / (k * self.pairs.area * along)
             far = np.where(along > 0, far / along, np.inf)
         nearest = np.full(len(self.pushes.load), np.inf)
         np.minimum.at(nearest, of, far)
@@ -351,8 +348,7 @@ class ContactProblem(Loads):
         If penetrations are small enough, move tools whose reaction differs from the load.
         """
         found = self.found(at)
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         part = at.parts.cells[law.cell]
         new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
@@ -386,7 +382,7 @@ class ContactProblem(Loads):
             chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
             kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
             origin, order = joined([of.origin for of in both], kept)
-            law = ContactLaw(new.law.names, new.law.contacts, _merged([of.law.pairs for of in both], kept, order))
+            law = new.law.on(_merged([of.law.pairs for of in both], kept, order), origin)
             order = np.argsort(np.concatenate([of.law.key[rows] for rows, of in zip(chosen, both, strict=True)]))
             self.now = Current(law, origin, _merged([of.state for of in both], chosen, order))
         return bool(late.any())
@@ -397,17 +393,18 @@ class ContactProblem(Loads):
         Pairs that are open before and after the update are ignored, as are parts after `FOLLOWS` updates.
         """
         found = self.found(at)
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         pairs = new.law.pairs
-        gap = np.einsum("md,md->m", pairs.n, pairs.offset)
+        gap = pairs.gap_before()
         pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
-        now = ContactLaw(law.names, law.contacts, pairs)
+        now = law.on(pairs, new.origin)
         fresh = now.begins()
         _, new_at, old_at = np.intersect1d(now.key, law.key, return_indices=True)
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
             values[new_at] = getattr(state, name)[old_at]
+        if law.inertia:
+            carried["pressure"][new_at] += now.start[new_at] - law.start[old_at]
         of_old, of_new = at.parts.cells[law.cell], at.parts.cells[now.cell]
         updates = at.parts.largest(self.grid.comm, of_old, state.updates)
         updates = np.where(updates < 0, BEGIN, updates)
@@ -452,6 +449,8 @@ class ContactProblem(Loads):
         """See `Loads`: forces, N, and moments, N m, on the bodies (3,), in 3D (6,); displacements due to loads, m."""
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
+        if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
+            where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
         if self.pushes is not None:
             out["tool_travel"] = dict(zip(names, self.pushes.start + motion, strict=True))

@@ -79,6 +79,11 @@ class Ties(Acting):
         """Faces on the first side of each tie."""
         return [tie.one for tie in self._ties]
 
+    @property
+    def seeded(self) -> list[Surface]:
+        """Faces on both sides of each tie."""
+        return [faces for tie in self._ties for faces in (tie.one, tie.other)]
+
     def placed(self, place: Place) -> Loads:
         """Return the penalty forces in a substep."""
         grid, points = self._grid, place.points

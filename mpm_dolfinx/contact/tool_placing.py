@@ -101,7 +101,7 @@ class Tools(Touching):
     def masses(self) -> NDArray[np.float64]:
         """Masses, kg, and moments of inertia, kg m^2, of free tools (tools, q); 0 for other tools."""
         d = self.grid.dim
-        out = np.array([np.full(motion_count(d), tool.mass or 0.0) for tool in self.tools])
+        out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
             if tool.rotates(d):
                 row[d:] = tool.inertia(d)
@@ -236,7 +236,7 @@ class Tools(Touching):
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
         pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
-        return ContactLaw(self.names, self.tools, pairs), origin, pushes
+        return ContactLaw(self.names, self.tools, pairs, origin if place.inertia else None), origin, pushes
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]

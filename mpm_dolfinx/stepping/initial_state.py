@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF, SAME
+from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import pressure_at
 from mpm_dolfinx.bodies.faces import Surface, surface
@@ -45,7 +46,7 @@ from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
-from mpm_dolfinx.stepping.balances import Start
+from mpm_dolfinx.stepping.balances import Start, at_rest
 from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State, Stay
@@ -132,7 +133,12 @@ def begin_stage(
     state = scene.followed(state)
     if state.stays:  # points have the pressures of their cells, not of their pieces
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    rests, supported = not state.begins or state.held is not None, _holds_as(after, before)
     state = replace(state, stay=None)
+    if after.inertia and not before.inertia and rests and supported and not scene.momentum.own.rates:
+        state = _kept_at_rest(scene, state)
+    else:
+        state = replace(state, held=None)
     own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
     removed, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
     standing = [body for body, is_present in enumerate(before.present) if is_present and body not in remove]
@@ -159,8 +165,8 @@ def begin_stage(
     if reset_displacement:
         points = replace(points, origin=points.corners)
     outcome = after.initial_outcome(before, state.outcome, np.nan if state.resets else 0.0)
-    rest = state.rest if _holds_as(after, before) else None
-    new = {"stage": after, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    rest = state.rest if supported else None
+    new = {"stage": after, "begins": True, "outcome": outcome, "rest": rest}
     new["trend"] = None if add or remove else state.trend
     return replace(state, points=points, pieces=pieces, **new)
 
@@ -201,6 +207,23 @@ def _released(
     parts = start.matrices.momentum.parts
     found = balancing_tractions(cut, state.points, stresses, surfaces, parts, (forces * counts)[:owned], now)
     return state, {traction_name(name): of for name, of in found.items()}
+
+
+def _kept_at_rest(scene: Scene, state: State) -> State:
+    """Return the state on the grid of the next step, with the forces `State.held` that keep it at rest there.
+
+    Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
+    """
+    start, forms = set_up(scene, state, 0.0), scene.momentum
+    state, unknowns, gravity = start.state, start.matrices.momentum.unknowns, start.acting[-1].gravity
+    where = start.on_grid.cut, start.on_grid.fill, state.points, start.data
+    place = Place(*where, state.t, TINY, state.t, state.outcome, inertia=True)  # dt = 0: no prescribed displacements
+    (loads,) = at_rest(scene, state, [state.stage.placed(place)])
+    when = When(state.t, FOREVER, gravity, FOREVER, 0.0)
+    residual, _ = scene.balance(when, start.matrices.momentum, start.data, loads, 0.0).assemble_residual()
+    forms.u.x.array[:] = 0.0
+    unknowns.add(forms.u, 1.0, residual)
+    return replace(state, held=forms.u.x.array.copy())
 
 
 def _gripped(
@@ -245,9 +268,9 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return the conditions with the scene's contacts, which stages cannot change."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
-    if given and given != standing:
+    if given and str([vars(one) for one in given]) != str([vars(one) for one in standing]):
         raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
-    return [*conditions, *(() if given else standing)]
+    return [*(one for one in conditions if one not in given), *standing]
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
@@ -310,6 +333,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
     """Return the points with new values of the data named in `fields`."""
     instance("stage: fields", fields, Mapping)
     data = dict(points.data)
+    comm = scene.grid.comm
     for name, value in fields.items():
         if name not in data and name in scene.materials.constants:
             law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
@@ -319,11 +343,12 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
         if name in data and new.shape == data[name].shape[1:]:
             new = np.broadcast_to(new, data[name].shape)
         if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
-            each = "one value for all, or " if name in data else ""
+            each = "one value for all, or " if name in data else f"one of {', '.join(data)}, or new data with "
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+        if name not in data and (close := get_close_matches(name, data)):
+            warn(comm, ConditionWarning, "%s: new data that no law reads; is %r meant?", what, close[0])
         data[name] = new.copy()
-    points = replace(points, data=data)
-    return everywhere(scene.grid.comm, lambda: scene.materials.changed("stage: fields", points, fields))
+    return everywhere(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
