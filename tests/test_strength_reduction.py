@@ -113,13 +113,13 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
-        (lambda: block([SOFT], load=1e4), {}, "no material has a strength, must have friction and cohesion"),
+        (lambda: block([SOFT], load=1e4), {}, "no material has a strength, one must have friction and cohesion"),
         (at_rest, {"rtol": 0}, r"rtol = 0, must be in \[1e-4, 0.5\]"),
         (at_rest, {"steps": 3}, "steps = 3, must be an integer >= 8"),
         (at_rest, {"dt": -1}, "dt = -1, must be > 0 and finite"),
         (at_rest, {"progress": 1}, "progress = 1, must be True or False"),
         (lambda: block([CLAY], load=0.0), {}, "have no stress, must be in equilibrium under loads"),
-        (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength / 16, must slide at some factor"),
+        (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength divided by 16, must slide at some factor"),
         (
             lambda: column(cells=2, material=replace(CLAY, conductivity=1e-5)),
             {},

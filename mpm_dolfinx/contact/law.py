@@ -7,7 +7,9 @@ At a position with gap g, the contact pressure and its energy per area are
 
 <...> is the positive part.  The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier
 lambda has one value for each contact and cell, which starts from the pressure of the previous step.  Augmentation
-(Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`.  Friction depends on means
+(Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`.  With inertia, all pairs
+of a point start from the lambda for which their mean pressure at the present gaps is that of the previous step.  The
+pressure then changes only with the gap, and a body at rest stays at rest.  Friction depends on means
 over the pairs in a cell: the slip s in the step, and the shear traction t_n after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
@@ -34,19 +36,19 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.contact.history import Rough
+from mpm_dolfinx.contact.history import Origin, Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""Stiffness k in units of (`resistance`) / (cell size)."""
+"""Stiffness k, times the cell size, divided by the modulus from `resistance`."""
 GRIP = 6.0
-"""Stiffness k_t in units of (`resistance`) / (cell size).  With a larger k_t, spurious shear stresses would alternate
-between cells: their nodal forces cancel, so nothing would resist them.
+"""Stiffness k_t, times the cell size, divided by the modulus from `resistance`.  With a larger k_t, spurious shear
+stresses would alternate between cells: their nodal forces cancel, so nothing would resist them.
 """
-DEPTH = 5e-4  # allowed mean penetration / cell size
-SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
+DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
+SLIVER = 0.25  # fraction of a cell's face: penetrations of smaller contact areas are reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
@@ -62,8 +64,8 @@ class ContactState:
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
     resticks: NDArray[np.bool_]  # whether the condition has returned from slip to stick (k,)
     parts: NDArray[np.bool_]  # whether the condition has opened after a return to stick (k,)
-    stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
-    # (k, 4): factor on the stiffness k, penetration / cell size after the last augmentation, number of augmentations,
+    stuck: NDArray[np.float64]  # shear traction in stick at the last update of slip (k, d), Pa
+    # (k, 4): factor on the stiffness k, penetration in cell sizes after the last augmentation, number of augmentations,
     updates: NDArray[np.float64]  # number of updates of the pairs; the same for all conditions of a connected part
 
     @property
@@ -78,30 +80,31 @@ class Touch:
 
     force: NDArray[np.float64]  # force on the points (m, d), N
     push: NDArray[np.float64]  # pressure (m,), Pa
-    stiff: NDArray[np.float64]  # minus the derivative of the pressure by the gap (m,), Pa/m
+    stiff: NDArray[np.float64]  # minus the derivative of the pressure with respect to the gap (m,), Pa/m
     pressure: NDArray[np.float64]  # mean pressure (k,), Pa
     sticks: NDArray[np.bool_]  # whether the condition is in contact and sticks (k,)
     trial: NDArray[np.float64]  # shear traction in stick (k, d), Pa
     shear: NDArray[np.float64]  # shear traction (k, d), Pa
     most: NDArray[np.float64]  # shear strength (k,), Pa
-    grip: NDArray[np.float64]  # minus the derivative of the shear traction by slip (k, d, d), Pa/m
-    by_pressure: NDArray[np.float64]  # derivative of the shear traction by the pressure (k, d)
+    grip: NDArray[np.float64]  # minus the derivative of the shear traction with respect to slip (k, d, d), Pa/m
+    by_pressure: NDArray[np.float64]  # derivative of the shear traction with respect to the pressure (k, d)
 
 
 class ContactLaw:
     """Contact pressures, shear tractions and their derivatives in a substep.
 
-    names: names of the `contacts`; pairs: possible contact pairs.
+    names: names of the `contacts`; pairs: possible contact pairs; origin: with inertia, the material points of the
+    pairs, else None.
     """
 
-    def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
+    def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs, origin: Origin | None):
         self.grid = pairs.grid
         self.names = names
         self.contacts = contacts
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Key of each condition (k,): (index of the contact) * (number of local cells) + local cell."""
+        """Key of each condition (k,): the index of the contact times the number of local cells, plus the local cell."""
         self.cell = key % self.grid.num_local
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
@@ -109,13 +112,23 @@ class ContactLaw:
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
         self._stiffness, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
+        self.inertia, start = origin is not None, pairs.pressure
+        if self.inertia:
+            start = origin.multipliers(start, self._stiffness * pairs.gap_before())
+        self.start = self.mean(start)
+        """Initial multipliers of the conditions (k,), Pa."""
+        self._deviation = start - self.start[self.of] if self.inertia else np.zeros_like(start)
         self.grips = any(contact.grips for contact in contacts)
 
+    def on(self, pairs: Pairs, origin: Origin) -> ContactLaw:
+        """Return the same law for other pairs."""
+        return ContactLaw(self.names, self.contacts, pairs, origin if self.inertia else None)
+
     def begins(self) -> ContactState:
-        """Return the initial state: pressures of the previous step, and stick everywhere."""
+        """Return the initial state: initial multipliers, and stick everywhere."""
         k, d = len(self.key), self.grid.dim
         none, zero = np.zeros(k, dtype=bool), np.zeros((k, d))
-        return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
+        return ContactState(self.start, zero, none, none, zero, np.full((k, 4), BEGIN))
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (k, ...) of values (m, ...) over the pairs of each condition."""
@@ -129,14 +142,18 @@ class ContactLaw:
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
+    def multiplier(self, state: ContactState) -> NDArray[np.float64]:
+        """Return the multipliers (m,), Pa, of the pairs."""
+        return state.pressure[self.of] + self._deviation
+
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
         """Return the stiffness k (m,), Pa/m, of the pairs."""
         return state.updates[self.of, 0] * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
-        """Return forces and derivatives for pairs with a geometry `at`."""
+        """Return the forces of pairs with the geometry `at`, and the derivatives of these forces."""
         stiffness = self.stiffness(state)
-        push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
+        push = np.maximum(0.0, self.multiplier(state) - stiffness * at.gap)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
         rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         touches = (push > 0) | (at.gap <= rounding)
@@ -172,7 +189,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return D (m d, m d): minus the derivative of the forces by w, without the rotation of shear tractions."""
+        """Return minus the derivative D (m d, m d) of forces with respect to w, without rotation of shear tractions."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -211,7 +228,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip; return the state and whether any changed.  `sticks`: allow returns to stick."""
+        """Update which conditions slip; return the state, and whether any condition changed.  `sticks`: allow stick."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -277,7 +294,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep deviations of shear tractions from the mean in a cell, as repeated averaging causes creep.
+        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averaging causes creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

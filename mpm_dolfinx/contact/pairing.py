@@ -38,15 +38,15 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap / cell size that may close in a step.  Steps with larger motion are rejected."""
+"""Largest gap, divided by the cell size, that may close in a step.  Steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Gap / cell size above which faces cannot touch before the next update of the pairs."""
+"""Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration / cell size above which a position lies behind a thin body and is not paired."""
+"""Penetration, divided by the cell size, above which a position lies behind a thin body and is not paired."""
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""(Distance from points on the other surface) / cell size below which domain corners follow the Q1 field alone."""
+"""Distance from the other surface, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
 """Upper bound of the number of quadrature points of a process on a surface."""
 
@@ -73,7 +73,7 @@ class Pairs(NamedTuple):
 
 
 class Contacts(Touching):
-    """The contacts between groups in a stage; setting: data of the stage; contacts: by name."""
+    """The contacts between groups in a stage; setting: data of the stage; contacts: contacts by name."""
 
     conditions, title = (Contact,), "contacts"
 
@@ -99,9 +99,10 @@ class Contacts(Touching):
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             present = replace(points, corners=points.corners + moved)
-            return self._law(cut, points, self._opposite_all(cut, present), present, present, cell_pairs)
+            opposite = self._opposite_all(cut, present)
+            return self._law(cut, points, opposite, present, present, cell_pairs, place.inertia)
 
-        first_law = self._law(cut, points, found, cut.points, points, cell_pairs)
+        first_law = self._law(cut, points, found, cut.points, points, cell_pairs, place.inertia)
         return ContactLoads(self, cut, *first_law, again, cell_pairs)
 
     def _law(
@@ -112,10 +113,12 @@ class Contacts(Touching):
         seen: MaterialPoints,
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
+        inertia: bool,
     ) -> tuple[ContactLaw, Origin]:
         """Return the contact law of pairs that were found for the points `seen`.
 
-        `points` are the points at the start of the step, with the contact history; `present` are the current points.
+        `points` are the points at the start of the step, with the contact history; `present` are the current points;
+        `inertia`: whether bodies have inertia.
         """
         grid = self.grid
         d = self.grid.dim
@@ -158,9 +161,8 @@ class Contacts(Touching):
         x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)
         own = number, grid.local(cell), *sent[:, 3:6].T, shear, x, sign
         pairs = FacePairs(grid, *own, other, y, n, offset, place)
-        return ContactLaw(self.names, self.contacts, pairs), Origin(
-            exchange, at, values[:, 0].astype(np.int64), values[:, 3]
-        )
+        origin = Origin(exchange, at, values[:, 0].astype(np.int64), values[:, 3])
+        return ContactLaw(self.names, self.contacts, pairs, origin if inertia else None), origin
 
     def _opposite_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
         """Return the facets and pairs of each contact, see `_opposite`."""
@@ -237,7 +239,7 @@ class Contacts(Touching):
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) just inside the chosen facets at positions x (m, d).
 
-        If a cell contains no quadrature point of the face, the cell of the facet is returned in its place.
+        If a cell contains no quadrature point of the face, the cell of the facet is returned instead.
         """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
@@ -245,7 +247,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) are near another group; points: at the start of the step."""
+        """Return which corners (n, 2^d, d) are near another group; points: points at the start of the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
@@ -283,7 +285,7 @@ class Contacts(Touching):
     def check_start(self, place: Place) -> None:
         """Raise an error if groups overlap at the start of the stage."""
         if message := self._too_deep(place.cut, place.points):
-            raise ValueError(f"{message}, at the start t = {place.start:g} s, must touch or be apart")
+            raise ValueError(f"{message}, at the start t = {place.start:g} s, must be apart or touch")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
         """Return a message with depth and position of an overlap of groups, or "" if none overlap."""

@@ -30,7 +30,7 @@ class Geometry(NamedTuple):
     """Geometry of m contact pairs at relative displacements w (m, d), m."""
 
     gap: NDArray[np.float64]  # gap (m,), m; negative in penetration
-    n: NDArray[np.float64]  # derivative of the gap by w (m, d): the outward unit normal of the other side
+    n: NDArray[np.float64]  # derivative of the gap with respect to w (m, d): outward unit normal of the other side
     curvature: NDArray[np.float64] | None  # second derivative of the gap (m, d, d), 1/m; None if zero
     slip: NDArray[np.float64]  # slip in the step (m, d), m
     arm: NDArray[np.float64]  # lever arm for moments (m, d), m
@@ -116,6 +116,10 @@ class ToolPairs(Pairs):
         everywhere(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
+    def gap_before(self) -> NDArray[np.float64]:
+        """Return the gaps (m,), m, at the start of the step: positions carried by the tool keep their gap."""
+        return self.at(self.carried - self.now, np.zeros(len(self.tools))).gap
+
     @property
     def largest_coordinate(self) -> NDArray[np.float64]:
         """See `Pairs`.  User functions are evaluated at true positions, whose size decides the rounding error."""
@@ -134,9 +138,13 @@ class FacePairs(Pairs):
     place: NDArray[np.int64]  # identifier of the point, the same in all updates of the pairs in a step (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`.  Moments refer to the positions at the start of the step."""
+        """See `Pairs`.  Lever arms are those at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
+
+    def gap_before(self) -> NDArray[np.float64]:
+        """Return the gaps (m,), m, at the start of the step."""
+        return np.einsum("md,md->m", self.n, self.offset)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""

@@ -44,7 +44,7 @@ class Tie:
         alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
         small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
         if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
-            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a body from mpm.box, with equal faces")
+            raise ValueError(f"{line(tied)}: its sides must be opposite sides of a body from mpm.box, with equal faces")
         self.offset = opposite[self.partner] - at
 
 
@@ -78,6 +78,11 @@ class Ties(Acting):
     def surfaces(self) -> list[Surface]:
         """Faces on the first side of each tie."""
         return [tie.one for tie in self._ties]
+
+    @property
+    def seeded(self) -> list[Surface]:
+        """Faces on both sides of each tie."""
+        return [faces for tie in self._ties for faces in (tie.one, tie.other)]
 
     def placed(self, place: Place) -> Loads:
         """Return the penalty forces in a substep."""

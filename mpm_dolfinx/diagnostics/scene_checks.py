@@ -80,7 +80,7 @@ def check_held(
                 f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0] + grid.base)}]" if count > 1 else "the body"
             )
             raise ValueError(
-                f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
+                f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} modes; "
                 "it must be constrained by walls that it touches, by prescribed displacements, or by contact with "
                 "a tool or a constrained group"
             )

@@ -23,7 +23,7 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners / cell size for which a cut remains valid.  After larger motion the domains are cut again.
+"""Largest motion of corners, divided by the cell size, for which a cut remains valid.  Otherwise domains are cut again.
 
 Compared with a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
 settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
@@ -138,7 +138,7 @@ class CutDomains(Keyed):
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return for each connected part (count,) the largest motion of corners since the cut / cell size.
+        """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
 
         `part` (n,) is the index of the part to which each point belongs.
         """

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -27,18 +27,18 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap / cell size between faces of two domains that still count as one surface.  Halving this value changes the
-result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
-"""
+"""Largest gap between faces of two domains that count as one surface, divided by the cell size.  Halving this value
+changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
+finer cells by 9.0e-02."""
 CRUMB = NEAR
-"""Area of a part / area of its cell, below which the part is dropped; others receive its mass.  Source: as `NEAR`."""
+"""Area of a part, divided by the area of its cell, below which other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Area of a part / area of its cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
+"""Area of a part in cell areas.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
 Source: definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell.
 """
 COVERED = 0.25
-"""Largest difference (area of pieces) - (filled area) in a cell / cell area.  Source: definition, one domain."""
+"""Largest difference between the pieces' area and the filled area, in cell areas.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -391,10 +391,18 @@ class RefilledCells:
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
+        faces = self.faces
+        index = np.full((len(points), 5), NONE)  # index of each face among the outer faces; the last one stays NONE
+        index[faces.point, faces.face] = np.arange(len(faces.face))
+        outer = index[pieces.point[left[of]][:, None], rings.edge] != NONE
+        rings = replace(rings, edge=np.where(outer, rings.edge, NONE))
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
         near = NEAR * self.grid.least  # tolerance: rounding would otherwise split a surface on a grid line
-        polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
+        halves = self._place(self.cell[left][of], halves)
+        polygons = rings.within(halves, near)
+        inside = np.clip(polygons.x, halves.min(axis=1)[:, None], halves.max(axis=1)[:, None])
+        polygons = replace(polygons, x=inside).simplified(near)
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
         large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
@@ -404,14 +412,9 @@ class RefilledCells:
         corners = np.empty_like(quads)
         corners[:, RING] = quads
         parent, area, ends = _no_faces(len(quads))
-        faces = self.faces
-        index = np.full((len(points), 4), NONE)
-        index[faces.point, faces.face] = np.arange(len(faces.face))
         for k in range(4):
             at = np.flatnonzero(edge[:, k] != NONE)
-            row = index[pieces.point[piece[at]], edge[at, k]]
-            at, row = at[row != NONE], row[row != NONE]
-            face = SIDE[k]
+            row, face = index[pieces.point[piece[at]], edge[at, k]], SIDE[k]
             old = points.corners[faces.point[row]]
             low, high = (old[np.arange(len(row)), FACES[2][faces.face[row], e]] for e in (0, 1))
             chord = high - low

@@ -462,7 +462,7 @@ class MomentumProblem:
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements (active dofs,), m, for Newton's method.
 
-        Each of the loads may propose a guess, such as a rigid rotation.  One more extrapolates the last step's motion.
+        Each of the loads may propose a guess, such as a rigid rotation.  Another guess extrapolates the last motion.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
@@ -544,7 +544,7 @@ class MomentumProblem:
 
         For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
         subtracted, so that even a load below this error causes a solve.  For the second, the force scale of a part is
-        at least (rounding error) / (tolerance).  A residual as small as the rounding error then counts as converged.
+        at least the rounding error divided by the tolerance.  A residual within rounding then counts as converged.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

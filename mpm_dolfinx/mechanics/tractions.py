@@ -3,9 +3,8 @@
 
 The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. The virtual work of
 a pressure is -int p n . v da on the present area. The tangent of this term is symmetric except for a contribution p/2
-(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. The
-contribution also vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the
-wall.
+(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. It also
+vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
 """
 
 from __future__ import annotations
