@@ -37,6 +37,13 @@ With --graded, cells are fine in a region of 2 B x 0.75 B below the footing.  Ou
 by a tenth from one to the next, up to eight times the smallest length.  The 20 B x 10 B of soil then have hardly more
 cells than 4 B x 2.5 B with fine cells only.
 
+With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells.  The
+footings are tools: below a smooth prescribed displacement, faces of the soil would move outward and enlarge the
+footing.  A quarter of the square is computed in 3D, also on several processes.  N_c is the limit load, divided by area
+and c.  Bounds for a rough square are 5.52 and 6.22 (Salgado et al. 2004), for a smooth one 2 + pi and 5.71 (Shield and
+Drucker 1955).  Circles are computed in axisymmetry, with about twice as many cells over the width.  Exact limit loads
+are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth ones (Shield 1955).
+
 With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their position between
 steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are therefore cut.  The option
 --viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
@@ -46,6 +53,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, fields, replace
+from itertools import product
 from pathlib import Path
 
 import common
@@ -82,6 +90,12 @@ NEAR = (1.0, 0.75)  # size of the computed half of the fine region, divided by B
 RATIO, LARGEST = 1.1, 8  # ratio of the sizes of neighbouring cells; of the largest and the smallest cells
 FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil, divided by B
 ROUND = 6.05  # limit load of a rough circular footing, divided by area and s_u
+KNOWN = {  # bounds of limit loads, divided by area and s_u
+    "square": {"rough": (5.52, 6.22), "smooth": (2 + np.pi, 5.71)},
+    "circle": {"rough": (ROUND, ROUND), "smooth": (5.69, 5.69)},
+}
+SOLID = {"box": 5.0, "near": (0.8, 0.5), "ratio": 1.2}  # for --square, divided by B: soil, fine region; see RATIO
+LIMIT_DEPTH, LIMIT_STEPS = 0.0015, 8  # for --square: depth / B, number of steps
 
 
 def capacity(friction: float) -> float:
@@ -222,6 +236,41 @@ def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, gra
     return out
 
 
+def bearing(shape: str, roughness: str, cells: int) -> dict[str, float]:
+    """Push a square (a quarter, in 3D) or a circle (in axisymmetry) to its limit load; print and return the results.
+
+    shape, roughness: keys of `KNOWN`.  Returns N_c, its distance to the bounds (0 between them), and the costs.
+    """
+    began, h, flat = time.process_time(), WIDTH / cells, 2 if shape == "square" else 1
+    wide, deep = (round(edge * cells) * h for edge in SOLID["near"])
+    size = [0.0] * flat + [-SOLID["box"]], [SOLID["box"]] * flat + [2 * h]
+    fine = [0.0] * flat + [-deep], [wide] * flat + [2 * h]
+    grid = mpm.Grid(lines=mpm.graded(*size, [fine], h, SOLID["ratio"], LARGEST * h), axisymmetric=flat == 1)
+    body = mpm.box(grid, size[0], [*size[1][:flat], 0])
+    soil = mpm.MohrCoulomb(
+        bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear, friction=0, dilation=0, cohesion=COHESION
+    )
+    down, half = np.eye(flat + 1)[flat] * -LIMIT_DEPTH * WIDTH, WIDTH / 2
+    block = mpm.Convex(np.array(list(product(*[(-half, half)] * flat, (0.0, WIDTH)))))
+    glued = 9 * COHESION if roughness == "rough" else 0.0
+    push = mpm.Tool(block, lambda t: down * t, adhesion=glued, name="footing")
+    walls = {"left": "x", "right": "x", "bottom": "xyz"[: flat + 1]}
+    walls |= dict.fromkeys(("front", "back") * (flat == 2), "y")
+    run = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[push]).run(1.0, 1 / LIMIT_STEPS)
+    area = WIDTH**2 / 4 if shape == "square" else np.pi / 4 * WIDTH**2
+    N, (low, high) = -run.tool_forces["footing"][:, flat] / (area * COHESION), KNOWN[shape][roughness]
+    out = {"N": float(N[-1]), "error": float(min(N[-1] / low - 1, 0) + max(N[-1] / high - 1, 0))}
+    out |= {"rise": float(N[-1] / N[-2] - 1), "cells": int(grid.shape.prod()), "points": run.points}
+    out |= {"newton": run.newton, "iterations": run.coupling, "MB": run.memory, "cpu": time.process_time() - began}
+    if common.first():
+        bounds = f"{low:.2f} to {high:.2f}" if low < high else f"{low:.2f}"
+        print(f"{roughness} {shape}, {cells} cells over the width: N_c = {N[-1]:.3f}, known {bounds}; ", end="")
+        print(f"{out['rise']:+.2%} in the last step; {out['cells']} cells, {run.points} points, ", end="")
+        print(f"{run.newton} Newton steps, {run.coupling} iterations, {run.memory:.0f} MB, ", end="")
+        print(f"{out['cpu']:.0f} s of processor time", flush=True)
+    return out
+
+
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__, processes=True)
@@ -236,9 +285,12 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument(
         "--graded", action="store_true", help="only the undrained limit load, in a large box of graded cells"
     )
+    parser.add_argument(
+        "--square", action="store_true", help="only limit loads of squares, in 3D, and circles, on graded cells"
+    )
     o = parser.parse_args(argv)
-    if o.graded and (o.steps, o.depth) != (None, 1.0):
-        parser.error("--graded: must go without --steps and --depth")
+    if (o.graded or o.square) and (o.steps, o.depth, o.graded and o.square) != (None, 1.0, False):
+        parser.error("--graded, --square: must go without --steps and --depth, and without each other")
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
         parser.error(f"--cells {o.cells}: must be odd and >= 3; --depth {o.depth:g}: must be in (0, 1.5]")
     if o.steps is not None and (o.steps < 1 or not 1 <= o.box <= 32):
@@ -247,9 +299,13 @@ def main(argv: list[str] | None = None) -> dict:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
     if o.steps is None and (o.box, o.method, o.viscosity) != (BOX[0], methods[0], 0.0):
         parser.error("--box, --method, --viscosity: must go with --steps")
-    if o.steps is None:
-        parser.refuse_processes(" without --steps")
+    if o.steps is None and not o.square:
+        parser.refuse_processes(" without --steps or --square")
     with common.results(o) as out:
+        if o.square:
+            for shape, cells in (("square", o.cells), ("circle", 2 * o.cells - 1)):
+                out |= {f"{how} {shape}": bearing(shape, how, cells) for how in KNOWN[shape]}
+            return out
         if o.graded:
             out |= of_many_sizes(o.cells, o.out)
             return out

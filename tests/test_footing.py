@@ -117,6 +117,19 @@ def test_soil_with_a_small_viscosity_resists_in_proportion_to_it():
     assert loads[2] - loads[0] == pytest.approx(2 * (loads[1] - loads[0]), rel=0.1)
 
 
+@pytest.mark.parametrize("roughness", ["rough", "smooth"])
+def test_circular_footings_on_graded_cells_tend_to_exact_loads_from_below(roughness):
+    coarse, fine = (footing.bearing("circle", roughness, cells)["error"] for cells in (5, 9))
+    assert -0.12 < coarse < 1.5 * fine < 0
+
+
+@pytest.mark.slow
+def test_a_square_footing_in_3d_tends_to_its_bounds_from_below_with_few_iterations():
+    coarse, fine, smooth = (footing.bearing("square", *of) for of in (("rough", 3), ("rough", 5), ("smooth", 3)))
+    assert coarse["error"] < 2 * fine["error"] < 0 and fine["error"] > -0.07 and smooth["N"] < coarse["N"]
+    assert all(run["rise"] < 4e-3 and run["iterations"] < 6 * run["newton"] for run in (coarse, fine, smooth))
+
+
 def test_options_that_would_change_nothing_without_steps_are_refused(capsys):
     for option in ("--viscosity=0.1", "--box=4", "--method=backward-euler"):
         with pytest.raises(SystemExit):

@@ -235,8 +235,9 @@ def test_conditions_on_displacements_of_sides_act_on_these(monkeypatch, conditio
     s = mpm.Simulation(grid, [box], [mpi_renewal.CLAY], numerics=mpm.Numerics(renewal=True), **acting)
     result = s.run(0.5, 1 / 16, progress=False)
     points, stage = s.points, s.state.stage
-    assert result.renewed > 10 and stage.seeded
-    for patch in map(s.scene.on_grid(points).cut.surface, stage.seeded):
+    needed = [*(faces for _, faces, _ in stage.held), *(faces for one in stage.acting for faces in one.seeded)]
+    assert result.renewed > 10 and needed
+    for patch in map(s.scene.on_grid(points).cut.surface, needed):
         assert patch.origin(points) + patch.base == pytest.approx(patch.X, abs=1e-12)
 
 

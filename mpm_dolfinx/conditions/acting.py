@@ -315,11 +315,8 @@ class Acting:
     """Faces that tools may touch; None without tools."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements: (condition, faces, prescribed axes)."""
-
-    @property
-    def seeded(self) -> list[Surface]:
-        """Faces whose displacement from the seeded position a condition needs; renewal leaves their domains."""
-        return [faces for _, faces, _ in self.held]
+    seeded: Sequence[Surface] = ()
+    """Further faces whose displacement from the seeded position is needed; renewal leaves their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""

@@ -68,21 +68,13 @@ class Ties(Acting):
         self._grid, self._materials = setting.grid, setting.materials
         of = setting.sides.of
         self._ties = [Tie(tied, of(tied), of(Tied(tied.other, tied.side))) for tied in ties.values()]
+        self.surfaces = [tie.one for tie in self._ties]
+        self.seeded = [faces for tie in self._ties for faces in (tie.one, tie.other)]
         sides = [(tied, (tie.one, tie.other)) for tied, tie in zip(ties.values(), self._ties, strict=True)]
         excluded = [(one, (of(one),)) for one in setting.of(Quiet, Drained, Inflow, Rain).values()]
         for (one, faces), (other, others) in [*combinations(sides, 2), *product(sides, excluded)]:
             for a, b in product(faces, others):
                 a.check_apart(b, (one, other))
-
-    @property
-    def surfaces(self) -> list[Surface]:
-        """Faces on the first side of each tie."""
-        return [tie.one for tie in self._ties]
-
-    @property
-    def seeded(self) -> list[Surface]:
-        """Faces on both sides of each tie."""
-        return [faces for tie in self._ties for faces in (tie.one, tie.other)]
 
     def placed(self, place: Place) -> Loads:
         """Return the penalty forces in a substep."""

@@ -147,11 +147,10 @@ class Tool:
             what = f"Tool: load = {line(self.load)} and direction = {line(self.direction)}"
             raise ValueError(f"{what}, must be given together")
         self._check_free()
-        for name in ("displacement", "rotation_rad", "load"):
-            value = getattr(self, name)
-            if callable(value):
+        for name, value in vars(self).items():
+            if name in ("displacement", "rotation_rad", "load") and callable(value):
                 check_names(f"{line(self)}: {name}", value, ("t",))
-            elif isinstance(value, (list, np.ndarray)):
+            elif isinstance(value, (list, np.ndarray, HalfSpace, Ball, Convex, Cone)):
                 object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)

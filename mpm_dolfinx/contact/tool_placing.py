@@ -228,11 +228,11 @@ class Tools(Touching):
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
-        cell, place, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         acts = np.ones(len(number)), self.tools, poses
-        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
+        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, places, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
         pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))

@@ -374,19 +374,9 @@ class RefilledCells:
                 area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * around * dense[sides]
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
 
-    @property
-    def remainders(self) -> New:
-        """New domains for the remaining parts of removed domains outside the renewed cells."""
-        return self._remainders[0]
-
-    @property
-    def outside(self) -> NDArray[np.int64]:
-        """Indices of the pieces of removed domains outside the renewed cells."""
-        return self._remainders[1]
-
     @cached_property
-    def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """The results of `remainders` and `outside`.  New domains from the same piece form a group, see `New`."""
+    def remainders(self) -> tuple[New, NDArray[np.int64]]:
+        """Pieces of removed domains outside the renewed cells: new domains, a group for each piece; the pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
@@ -402,8 +392,7 @@ class RefilledCells:
         halves = self._place(self.cell[left][of], halves)
         polygons = rings.within(halves, near)
         inside = np.clip(polygons.x, halves.min(axis=1)[:, None], halves.max(axis=1)[:, None])
-        polygons = replace(polygons, x=inside).simplified(near)
-        row, quads, edge = polygons.quadrilaterals()
+        row, quads, edge = replace(polygons, x=inside).simplified(near).quadrilaterals()
         piece = left[of[row]]
         large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
         large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # crumbs change no numbers
@@ -452,15 +441,16 @@ class RefilledCells:
         inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         sizes = grid.sizes_of(np.arange(self.cells))[..., None]
         slope = (axes * inverse[:, None]) @ axes.swapaxes(1, 2) @ right / sizes
-        return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.outside]])[group]]
+        cells = np.concatenate([np.flatnonzero(self.chosen), self.cell[self.remainders[1]]])
+        return slope[cells[group]]
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
         """Pieces of removed domains, the group that receives each piece, and the piece's fraction of the domain."""
-        pieces = self.pieces
+        pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
-        piece = np.concatenate([into, self.outside])
-        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.outside))])
+        piece = np.concatenate([into, outside])
+        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(outside))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
         return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped parts
@@ -473,11 +463,10 @@ class RefilledCells:
         of, at = ranges(first, stop - first)
         at = order[at]
         old = self.pieces.point[piece[of]]
-        common = np.zeros(len(of))
         rings, which = _convex(self.points.corners[old], self._volume(self.cell[piece[of]]))
         both = rings.within(corners[at][which][:, RING])
         around = self.grid.around(both.centroid) if self.grid.axisymmetric else 1.0
-        common += np.maximum(sum_by(which, both.area * around, len(of)), 0.0)
+        common = np.maximum(sum_by(which, both.area * around, len(of)), 0.0)
         whole = np.abs(domain_volumes(corners[at], self.grid.axisymmetric))
         common += EPSILON * whole  # a domain without overlap receives the mean of its cell
         total = sum_by(of, common, len(piece))
@@ -502,8 +491,9 @@ class RefilledCells:
         number = self._group(cell)
         whole = np.maximum(sum_by(number, length, count), TINY)
         means = np.stack([sum_by(number, length * column, count) / whole for column in flat.T], axis=1)
-        pieces = values[self.pieces.point[self.outside]].reshape(len(self.outside), flat.shape[1])
-        out = np.concatenate([means, pieces])[group] * (parent != NONE).any(axis=1)[:, None]
+        pieces = values[self.pieces.point[self.remainders[1]]]
+        out = np.concatenate([means, pieces.reshape(len(pieces), flat.shape[1])])[group]
+        out *= (parent != NONE).any(axis=1)[:, None]
         return out.reshape(len(corners), *values.shape[1:])
 
 

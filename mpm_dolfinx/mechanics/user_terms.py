@@ -85,16 +85,8 @@ class OwnTermsOfStage(Acting):
         self._terms = [
             (term, setting.sides.of(term.given) if isinstance(term.given, OnSide) else None) for term in terms
         ]
-
-    @property
-    def surfaces(self) -> list[Surface]:
-        """Faces with terms."""
-        return [faces for _, faces in self._terms if faces is not None]
-
-    @property
-    def seeded(self) -> list[Surface]:
-        """Faces whose displacement a term depends on."""
-        return [faces for term, faces in self._terms if term.seeded]
+        self.surfaces = [faces for _, faces in self._terms if faces is not None]
+        self.seeded = [faces for term, faces in self._terms if term.seeded]
 
     def placed(self, place: Place) -> Loads:
         """Return the terms at the integration points of bodies and sides."""

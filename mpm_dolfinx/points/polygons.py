@@ -89,10 +89,9 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices nearer than `near`, m, to the next vertex or to a straight edge.
+        """Return the polygons without vertices nearer than `near`, m, to the next one, or to a line within one edge.
 
-        An edge is straight through a vertex if it has the same identifier on both sides.  On the side of a trapezoid,
-        such a vertex would leave the division into quadrilaterals to rounding: both diagonals divide it alike.
+        Rounding would otherwise divide a trapezoid with such a vertex: its diagonals divide the area equally evenly.
         """
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))

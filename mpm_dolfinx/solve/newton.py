@@ -248,13 +248,14 @@ class Newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
-            self.report.coupling += self._direction(errors, fresh and slow)
+            self.report.coupling += self._direction(errors, slow)
             if self._storage is not None:
                 log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
-            count, slow = count + 1, fresh
+            count += 1
             # a residual is infinite before any fluid has been exchanged
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
+            slow = fresh and bool((lags & (errors.p > errors.u)).any())
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle()
             if self._momentum.settle(errors.worst <= SETTLED) or seeps:
@@ -434,8 +435,8 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem; return the number of coupling iterations.
 
-        slow: whether the last step converged slowly with a new tangent.  The tangent then also contains the derivative
-        of fluxes with respect to displacements.
+        slow: whether the storage's residual is the larger one and a new tangent has reduced it little.  The tangent
+        then also contains the derivative of fluxes with respect to displacements.
         """
         # the next residual needs no more accuracy
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing

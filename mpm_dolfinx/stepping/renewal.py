@@ -13,8 +13,8 @@ Remainders of old domains outside these cells become domains. Masses, volumes an
 each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
 These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
 range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
-too. Cells with elastic soil, several bodies, or several surface crossings are unchanged, and cells with a
-domain on a side that is tied, has a prescribed displacement, or a term with its displacement.
+too. Cells with elastic soil, several bodies, several surface crossings, or domains on a side whose displacement a
+condition needs are unchanged.
 """
 
 from __future__ import annotations
@@ -97,14 +97,12 @@ class Renewal:
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask (n,) of `flowed` points that may be renewed.
-
-        Points with a probe, kept pieces, or a face in `Stage.seeded` are not renewed.
-        """
-        free = self.flowed(state.points)
-        if seeded := [keys(faces.id, faces.face) for faces in state.stage.seeded]:
+        """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces whose displacement is needed."""
+        free, stage = self.flowed(state.points), state.stage
+        needed = [*(faces for _, faces, _ in stage.held), *(faces for one in stage.acting for faces in one.seeded)]
+        if needed:
             faces = self._faces(state.points)
-            free[faces.point[np.isin(faces.key, np.concatenate(seeded))]] = False
+            free[faces.point[np.isin(faces.key, np.concatenate([keys(one.id, one.face) for one in needed]))]] = False
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps
@@ -137,16 +135,16 @@ class Renewal:
         return replace(made, points=with_faces(made.points), stay=stay), count
 
     def _renewed(self, state: State, free: NDArray[np.bool_]) -> tuple[State, int]:
-        stage, points, touched = state.stage, state.points, tuple(state.stage.kept(0))
+        stage, points = state.stage, state.points
         signs = self._signs((stage,), lambda: self._signatures(stage.faces), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
         work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
-        new = [work.full(), work.partial(), work.remainders]
+        new = [work.full(), work.partial(), work.remainders[0]]
         group = np.concatenate([one.group for one in new])
-        made = self._filled(points, work, new, touched)
+        made = self._filled(points, work, new, tuple(stage.kept(0)))
         if moves:
             masses = tuple(self._materials.present_density(of) * of.volume0 * of.J for of in (points, made))
             v, L = velocities(work, made.corners, made.x, group, masses)

@@ -116,11 +116,6 @@ class Stage:
         """Conditions that support faces, each with its faces and axes."""
         return [one for acting in self.acting for one in acting.held]
 
-    @property
-    def seeded(self) -> list[Surface]:
-        """Faces whose displacement from the seeded position a condition needs."""
-        return [faces for acting in self.acting for faces in acting.seeded]
-
     def placed(self, place: Place) -> list[Loads]:
         """Return the loads in the balance of momentum in a substep."""
         with _compat.Timer("loads"):
