@@ -247,9 +247,7 @@ def bearing(shape: str, roughness: str, cells: int) -> dict[str, float]:
     fine = [0.0] * flat + [-deep], [wide] * flat + [2 * h]
     grid = mpm.Grid(lines=mpm.graded(*size, [fine], h, SOLID["ratio"], LARGEST * h), axisymmetric=flat == 1)
     body = mpm.box(grid, size[0], [*size[1][:flat], 0])
-    soil = mpm.MohrCoulomb(
-        bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear, friction=0, dilation=0, cohesion=COHESION
-    )
+    soil = mpm.MohrCoulomb(bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear, friction=0, dilation=0, cohesion=COHESION)
     down, half = np.eye(flat + 1)[flat] * -LIMIT_DEPTH * WIDTH, WIDTH / 2
     block = mpm.Convex(np.array(list(product(*[(-half, half)] * flat, (0.0, WIDTH)))))
     glued = 9 * COHESION if roughness == "rough" else 0.0

@@ -51,11 +51,11 @@ class Origin:
         """
         pressure, gap = self.exchange.back(pressure), self.exchange.back(gap)
         of = np.unique(self.point + self.number * (self.point.max(initial=0) + 1), return_inverse=True)[1]
-        out, on, count = np.zeros(len(of)), np.ones(len(of), dtype=bool), len(of)
+        out, on = np.zeros(len(of)), np.ones(len(of), dtype=bool)
         np.minimum.at(out, of, gap)
-        out, force = out[of], sum_by(of, self.area * pressure, count)[of]
+        out, force = out[of], sum_by(of, self.area * pressure, len(of))[of]
         while (on & (pressure > 0)).any():
-            area, more = (sum_by(of, self.area * on * values, count)[of] for values in (np.ones(count), gap))
+            area, more = (sum_by(of, self.area * on * values, len(of))[of] for values in (np.ones(len(of)), gap))
             out = np.where(pressure > 0, (force + more) / np.maximum(area, TINY), out)
             if (on <= (out >= gap)).all():
                 break

@@ -215,14 +215,14 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
     Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
-    state, unknowns, gravity = start.state, start.matrices.momentum.unknowns, start.acting[-1].gravity
+    state, gravity = start.state, start.acting[-1].gravity
     where = start.on_grid.cut, start.on_grid.fill, state.points, start.data
     place = Place(*where, state.t, TINY, state.t, state.outcome, inertia=True)  # dt = 0: no prescribed displacements
     (loads,) = at_rest(scene, state, [state.stage.placed(place)])
     when = When(state.t, FOREVER, gravity, FOREVER, 0.0)
     residual, _ = scene.balance(when, start.matrices.momentum, start.data, loads, 0.0).assemble_residual()
     forms.u.x.array[:] = 0.0
-    unknowns.add(forms.u, 1.0, residual)
+    start.matrices.momentum.unknowns.add(forms.u, 1.0, residual)
     return replace(state, held=forms.u.x.array.copy())
 
 
