@@ -205,7 +205,7 @@ class Tools(Touching):
     def contact(self, place: Place) -> tuple[ContactLaw, Origin, Pushes]:
         """Return the contact law in a substep, the material points of its pairs, and the loads of tools."""
         cut, points = place.cut, place.points
-        start, t, inertia = place.start, place.t, place.inertia
+        start, t = place.start, place.t
         grid, d = self.grid, self.grid.dim
         patches = cut.surface(self.outside)
         x, area = patches.now(points), patches.area(points)
@@ -236,7 +236,7 @@ class Tools(Touching):
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
         pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
-        return ContactLaw(self.names, self.tools, pairs, origin if inertia else None), origin, pushes
+        return ContactLaw(self.names, self.tools, pairs), origin, pushes
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
