@@ -116,10 +116,6 @@ class ToolPairs(Pairs):
         everywhere(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
-    def gap_before(self) -> NDArray[np.float64]:
-        """Return the gaps (m,), m, at the start of the step: positions carried by the tool keep their gap."""
-        return self.at(self.carried - self.now, np.zeros(len(self.tools))).gap
-
     @property
     def largest_coordinate(self) -> NDArray[np.float64]:
         """See `Pairs`.  User functions are evaluated at true positions, whose size decides the rounding error."""
@@ -141,10 +137,6 @@ class FacePairs(Pairs):
         """See `Pairs`.  Lever arms are those at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
-
-    def gap_before(self) -> NDArray[np.float64]:
-        """Return the gaps (m,), m, at the start of the step."""
-        return np.einsum("md,md->m", self.n, self.offset)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""

@@ -236,7 +236,7 @@ class Tools(Touching):
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
         pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
-        return ContactLaw(self.names, self.tools, pairs, origin if place.inertia else None), origin, pushes
+        return ContactLaw(self.names, self.tools, pairs), origin, pushes
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
