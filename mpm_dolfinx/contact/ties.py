@@ -8,12 +8,14 @@ are measured from the seeded positions, so errors do not accumulate.  Forces on 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from itertools import combinations, product
 
 from petsc4py import PETSc
 
 import numpy as np
 import scipy.sparse
+from dolfinx import fem
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -26,6 +28,7 @@ from mpm_dolfinx.conditions.conditions import HOLD, Drained, Inflow, Quiet, Rain
 from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix, shape_values_in
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import Exchange
 
 
 class Tie:
@@ -127,6 +130,7 @@ class TieLoads(Loads):
         values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
         self._difference = lambda unknowns: at_nodes(grid, unknowns, cell, values, other)
+        self._cells, self._rest = (cell, other), 0.0
         self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -137,10 +141,22 @@ class TieLoads(Loads):
         """Add the penalty forces at u."""
         B = self._B(at.unknowns)
         w = B.createVecLeft()
-        B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
+        B.mult(at.unknowns.gather_owned((at.u + self._rest)[at.unknowns.owned]), w)
         w.array_w[:] = self._stiffness * (w.array_r + self._gap)
         B = B if on is at.unknowns else self._difference(on)
         B.multTransposeAdd(w, residual, residual)
+
+    def moved(self, u: fem.Function) -> Loads:
+        """Return the ties with differences of displacements changed by a displacement u."""
+        out = copy(self)
+        out._rest = u.x.array.copy()
+        return out
+
+    @property
+    def held_cells(self) -> NDArray[np.int32]:
+        """Cells of both sides."""
+        cell, other = self._cells
+        return np.append(cell, self._grid.local(Exchange(self._grid.comm, self._grid.owner(other)).send(other)))
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a zero matrix with the pattern of `coupling`."""

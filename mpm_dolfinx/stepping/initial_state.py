@@ -27,7 +27,7 @@ from mpm_dolfinx.bodies.bodies import pressure_at
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
-from mpm_dolfinx.conditions.acting import Loads, Place
+from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.conditions.conditions import Quiet
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
 from mpm_dolfinx.contact.groups import contacts_of
@@ -436,7 +436,8 @@ def balanced(scene: Scene, state: State) -> State:
         raise ValueError(f"initial_stress: must be in equilibrium with the loads at the start: {error}") from error
     left, count, points, held, rest, outcome = best
     _report(scene, seeded, points, count, left, any(one.touches for one in problem.loads))
-    rest = _rest(scene, problem.loads, rest) if any(one.stiff for one in problem.loads) else None
+    cells = np.concatenate([np.empty(0, np.int32), *(one.held_cells for one in problem.loads)])
+    rest = _rest(scene, np.unique(cells), rest) if over_all(scene.grid.comm, len(cells)) else None
     reactions = {name: values for name, values in outcome.items() if name == "reactions"}
     return replace(start.state, points=points, held=held, rest=rest, outcome={**state.outcome, **reactions})
 
@@ -460,10 +461,9 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
         log(comm, what, count, changed, largest, left)
 
 
-def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return w, a local array of nodal displacements, m, with zeros outside the cells of supported sides."""
-    nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
-    return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
+def _rest(scene: Scene, cells: NDArray[np.int32], w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return w, a local array of nodal displacements, m, with zeros outside these cells, which have supported sides."""
+    return np.where(np.repeat(scene.momentum.active_nodes(cells), scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
