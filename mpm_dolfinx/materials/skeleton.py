@@ -7,6 +7,7 @@ The material point method and the finite element reference use the same laws.  U
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from math import inf
@@ -176,6 +177,9 @@ class Skeleton:
         return [] if function is None else list(signature(function).parameters)
 
     def __post_init__(self):
+        for name, value in vars(self).items():
+            if isinstance(value, (list, np.ndarray)):
+                object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         functions(
             f"{type(self).__name__}: conductivity_law", [self.conductivity_law] * (self.conductivity_law is not None)
         )
