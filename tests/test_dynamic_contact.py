@@ -339,30 +339,6 @@ def test_a_disc_falls_on_ground_with_an_initial_stress(gap):
     assert np.isfinite(s.tangent(0.01).stiffness.data).all()
 
 
-@pytest.mark.parametrize("rough", [0.0, 0.3])
-@pytest.mark.parametrize("base", ["tool", "body"])
-def test_a_block_that_rests_off_the_grid_lines_stays_at_rest_when_inertia_begins(base, rough):
-    grid = mpm.Grid([0, 0], [1, 1], [10, 10])
-    walls, low = {"bottom": "xy", "left": "x", "right": "x"}, 0.433
-    block, ground = mpm.box(grid, [0.32, low], [0.68, low + 0.3]), mpm.box(grid, [0, 0], [1, low])
-    floor = mpm.Tool(mpm.HalfSpace((0, low), (0, 1)), friction=rough)
-    side = mpm.Displacement("left", (0, 0), components="x")
-    bodies, conditions = ([block], [floor, side]) if base == "tool" else ([ground, block], [mpm.Contact(0, 1, rough)])
-    if base == "body" and not rough:
-        walls |= {"left": "x"}
-        bodies[1] = mpm.box(grid, [0, low], [0.36, low + 0.3])
-    options = {"walls": walls, "conditions": conditions, "gravity": (0, -G), "inertia": False}
-    s = mpm.Simulation(grid, bodies, [STIFF], **options)
-    s.step(1.0)
-    (before,) = s.tool_forces.values()
-    s.stage(inertia=True)
-    for _ in range(3):
-        s.step(2e-3)
-        assert np.abs(s.points.data["velocity"]).max() < 1e-6
-        (force,) = s.tool_forces.values()
-        assert force[1] == pytest.approx(before[1], rel=2e-3)  # what the reset of the grid leaves
-
-
 def test_contact_that_never_settles_fails_the_step(monkeypatch):
     s = dropped(0.01, mass=10.0, velocity=(0, -1))
     monkeypatch.setattr("mpm_dolfinx.contact.free_tools.FreeTools.augment", lambda self, at: True)

@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -42,25 +41,6 @@ class Origin:
     point: NDArray[np.int64]  # index of the material point on this process (n,)
     number: NDArray[np.int64]  # index of the contact (n,)
     area: NDArray[np.float64]  # contact area (n,), m^(d-1)
-
-    def multipliers(self, pressure: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return lambda (m,), Pa, equal for the pairs of a point: their mean <lambda - gap> is the point's pressure.
-
-        pressure, gap (m,), Pa: pressures of the points, and gaps of the pairs times the contact stiffness.  Where the
-        pressure is zero, lambda is the smallest for which no pair has a pressure, or zero.
-        """
-        pressure, gap = self.exchange.back(pressure), self.exchange.back(gap)
-        of = np.unique(self.point + self.number * (self.point.max(initial=0) + 1), return_inverse=True)[1]
-        out, on, count = np.zeros(len(of)), np.ones(len(of), dtype=bool), len(of)
-        np.minimum.at(out, of, gap)
-        out, force = out[of], sum_by(of, self.area * pressure, count)[of]
-        while (on & (pressure > 0)).any():
-            area, more = (sum_by(of, self.area * on * values, count)[of] for values in (np.ones(count), gap))
-            out = np.where(pressure > 0, (force + more) / np.maximum(area, TINY), out)
-            if (on <= (out >= gap)).all():
-                break
-            on &= out >= gap  # pairs without pressure are left out
-        return self.exchange.send(out)
 
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray

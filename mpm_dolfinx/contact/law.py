@@ -7,9 +7,7 @@ At a position with gap g, the contact pressure and its energy per area are
 
 <...> is the positive part.  The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier
 lambda has one value for each contact and cell, which starts from the pressure of the previous step.  Augmentation
-(Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`.  With inertia, all pairs
-of a point start from the lambda for which their mean pressure at the present gaps is that of the previous step.  The
-pressure then changes only with the gap, and a body at rest stays at rest.  Friction depends on means
+(Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`.  Friction depends on means
 over the pairs in a cell: the slip s in the step, and the shear traction t_n after the previous step,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
@@ -36,7 +34,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.contact.history import Origin, Rough
+from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
@@ -93,11 +91,10 @@ class Touch:
 class ContactLaw:
     """Contact pressures, shear tractions and their derivatives in a substep.
 
-    names: names of the `contacts`; pairs: possible contact pairs; origin: with inertia, the material points of the
-    pairs, else None.
+    names: names of the `contacts`; pairs: possible contact pairs.
     """
 
-    def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs, origin: Origin | None):
+    def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
         self.grid = pairs.grid
         self.names = names
         self.contacts = contacts
@@ -112,23 +109,13 @@ class ContactLaw:
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
         self._stiffness, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
-        self.inertia, start = origin is not None, pairs.pressure
-        if self.inertia:
-            start = origin.multipliers(start, self._stiffness * pairs.gap_before())
-        self.start = self.mean(start)
-        """Initial multipliers of the conditions (k,), Pa."""
-        self._deviation = start - self.start[self.of] if self.inertia else np.zeros_like(start)
         self.grips = any(contact.grips for contact in contacts)
 
-    def on(self, pairs: Pairs, origin: Origin) -> ContactLaw:
-        """Return the same law for other pairs."""
-        return ContactLaw(self.names, self.contacts, pairs, origin if self.inertia else None)
-
     def begins(self) -> ContactState:
-        """Return the initial state: initial multipliers, and stick everywhere."""
+        """Return the initial state: pressures of the previous step, and stick everywhere."""
         k, d = len(self.key), self.grid.dim
         none, zero = np.zeros(k, dtype=bool), np.zeros((k, d))
-        return ContactState(self.start, zero, none, none, zero, np.full((k, 4), BEGIN))
+        return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (k, ...) of values (m, ...) over the pairs of each condition."""
@@ -142,10 +129,6 @@ class ContactLaw:
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
-    def multiplier(self, state: ContactState) -> NDArray[np.float64]:
-        """Return the multipliers (m,), Pa, of the pairs."""
-        return state.pressure[self.of] + self._deviation
-
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
         """Return the stiffness k (m,), Pa/m, of the pairs."""
         return state.updates[self.of, 0] * self._stiffness
@@ -153,7 +136,7 @@ class ContactLaw:
     def touch(self, state: ContactState, at: Geometry) -> Touch:
         """Return the forces of pairs with the geometry `at`, and the derivatives of these forces."""
         stiffness = self.stiffness(state)
-        push = np.maximum(0.0, self.multiplier(state) - stiffness * at.gap)
+        push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
         rounding = ROUND_OFF * np.abs([self.grid.lower, self.grid.upper]).max()
         touches = (push > 0) | (at.gap <= rounding)

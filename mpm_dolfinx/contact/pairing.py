@@ -32,7 +32,7 @@ from mpm_dolfinx.contact.pairs import FacePairs
 from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
@@ -99,10 +99,9 @@ class Contacts(Touching):
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             present = replace(points, corners=points.corners + moved)
-            opposite = self._opposite_all(cut, present)
-            return self._law(cut, points, opposite, present, present, cell_pairs, place.inertia)
+            return self._law(cut, points, self._opposite_all(cut, present), present, present, cell_pairs)
 
-        first_law = self._law(cut, points, found, cut.points, points, cell_pairs, place.inertia)
+        first_law = self._law(cut, points, found, cut.points, points, cell_pairs)
         return ContactLoads(self, cut, *first_law, again, cell_pairs)
 
     def _law(
@@ -113,12 +112,10 @@ class Contacts(Touching):
         seen: MaterialPoints,
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
-        inertia: bool,
     ) -> tuple[ContactLaw, Origin]:
         """Return the contact law of pairs that were found for the points `seen`.
 
-        `points` are the points at the start of the step, with the contact history; `present` are the current points;
-        `inertia`: whether bodies have inertia.
+        `points` are the points at the start of the step, with the contact history; `present` are the current points.
         """
         grid = self.grid
         d = self.grid.dim
@@ -155,14 +152,15 @@ class Contacts(Touching):
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
-        exchange = Exchange(grid.comm, grid.owner(cell))
+        exchange = grid.to_owners(cell)
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, sign, place = sent[:, :3].T.astype(np.int64)
         x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)
         own = number, grid.local(cell), *sent[:, 3:6].T, shear, x, sign
         pairs = FacePairs(grid, *own, other, y, n, offset, place)
-        origin = Origin(exchange, at, values[:, 0].astype(np.int64), values[:, 3])
-        return ContactLaw(self.names, self.contacts, pairs, origin if inertia else None), origin
+        return ContactLaw(self.names, self.contacts, pairs), Origin(
+            exchange, at, values[:, 0].astype(np.int64), values[:, 3]
+        )
 
     def _opposite_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
         """Return the facets and pairs of each contact, see `_opposite`."""

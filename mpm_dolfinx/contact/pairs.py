@@ -23,7 +23,7 @@ from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere
+from mpm_dolfinx.parallel.exchange import everywhere
 
 
 class Geometry(NamedTuple):
@@ -116,10 +116,6 @@ class ToolPairs(Pairs):
         everywhere(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
-    def gap_before(self) -> NDArray[np.float64]:
-        """Return the gaps (m,), m, at the start of the step: positions carried by the tool keep their gap."""
-        return self.at(self.carried - self.now, np.zeros(len(self.tools))).gap
-
     @property
     def largest_coordinate(self) -> NDArray[np.float64]:
         """See `Pairs`.  User functions are evaluated at true positions, whose size decides the rounding error."""
@@ -141,10 +137,6 @@ class FacePairs(Pairs):
         """See `Pairs`.  Lever arms are those at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
-
-    def gap_before(self) -> NDArray[np.float64]:
-        """Return the gaps (m,), m, at the start of the step."""
-        return np.einsum("md,md->m", self.n, self.offset)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""
@@ -173,7 +165,7 @@ def at_nodes(
     numbers = unknowns.map.indices.reshape(-1, d)
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
-        exchange = Exchange(grid.comm, grid.owner(other))
+        exchange = grid.to_owners(other)
         columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
         column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)

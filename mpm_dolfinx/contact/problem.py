@@ -37,7 +37,7 @@ from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, sh
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FOLLOWS = 8  # largest number of updates of the pairs in a step
@@ -120,16 +120,10 @@ class Touching(Acting):
 class ContactProblem(Loads):
     """Contact forces in a substep.  `now` is replaced during the solution.
 
-    Parameters
-    ----------
-    law, origin
-        Contact law at the start of the step, and the material points of its pairs.
-    pushes
-        Prescribed loads on the tools.
-    again
-        Function from displacements (a local array, m) to law and origin of the pairs found there, see `FacePairs`.
-    cell_pairs
-        Function that returns all pairs of cells, as integers first * cells + second, that contact pairs may join.
+    law, origin: contact law at the start of the step, and the material points of its pairs; pushes: prescribed loads on
+    the tools; again: function from displacements (a local array, m) to law and origin of the pairs found there, see
+    `FacePairs`; cell_pairs: function that returns all pairs of cells, as integers first * cells + second, that contact
+    pairs may join.
     """
 
     linear, smooth, touches = False, False, True
@@ -229,7 +223,7 @@ class ContactProblem(Loads):
         """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
-        exchange = Exchange(grid.comm, grid.owner(cell))
+        exchange = grid.to_owners(cell)
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
@@ -304,7 +298,7 @@ class ContactProblem(Loads):
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = found.at.gap - law.multiplier(state) / k + self.pushes.load[of] / (k * self.pairs.area * along)
+            far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
             far = np.where(along > 0, far / along, np.inf)
         nearest = np.full(len(self.pushes.load), np.inf)
         np.minimum.at(nearest, of, far)
@@ -382,7 +376,7 @@ class ContactProblem(Loads):
             chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
             kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
             origin, order = joined([of.origin for of in both], kept)
-            law = new.law.on(_merged([of.law.pairs for of in both], kept, order), origin)
+            law = ContactLaw(new.law.names, new.law.contacts, _merged([of.law.pairs for of in both], kept, order))
             order = np.argsort(np.concatenate([of.law.key[rows] for rows, of in zip(chosen, both, strict=True)]))
             self.now = Current(law, origin, _merged([of.state for of in both], chosen, order))
         return bool(late.any())
@@ -395,16 +389,14 @@ class ContactProblem(Loads):
         found = self.found(at)
         law, state = self.now.law, self.now.state
         pairs = new.law.pairs
-        gap = pairs.gap_before()
+        gap = np.einsum("md,md->m", pairs.n, pairs.offset)
         pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
-        now = law.on(pairs, new.origin)
+        now = ContactLaw(law.names, law.contacts, pairs)
         fresh = now.begins()
         _, new_at, old_at = np.intersect1d(now.key, law.key, return_indices=True)
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
             values[new_at] = getattr(state, name)[old_at]
-        if law.inertia:
-            carried["pressure"][new_at] += now.start[new_at] - law.start[old_at]
         of_old, of_new = at.parts.cells[law.cell], at.parts.cells[now.cell]
         updates = at.parts.largest(self.grid.comm, of_old, state.updates)
         updates = np.where(updates < 0, BEGIN, updates)

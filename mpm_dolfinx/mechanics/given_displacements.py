@@ -261,20 +261,10 @@ class GivenDisplacements(Acting):
 class HoldLoads(Loads):
     """Prescribed displacements in a substep.
 
-    Parameters
-    ----------
-    acting
-        The prescribed displacements of the stage.
-    forms, data
-        Forms, and their points: one for each prescribed component, with stiffness, direction and gap.
-    held
-        Geometry and stiffness of all penalties.
-    row : (m,)
-        Index in `held` of each prescribed component.
-    share : (m, 2^d)
-        Fraction of each component's force on each node, without the fraction that walls of the grid bear.
-    place
-        Time and cut domains of the substep.
+    acting: the prescribed displacements of the stage; forms, data: forms, and their points, one for each prescribed
+    component, with stiffness, direction and gap; held: geometry and stiffness of all penalties; row (m,): index in
+    `held` of each prescribed component; share (m, 2^d): fraction of each component's force on each node, without the
+    fraction that walls of the grid bear; place: time and cut domains of the substep.
     """
 
     stiff = True

@@ -229,18 +229,9 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
-        Parameters
-        ----------
-        cut
-            The cut particle domains.
-        mass : (n,), kg
-            Masses of the points.
-        fill : (cells,)
-            Volume fraction of the local cells.
-        facets
-            Faces between two active cells, at least one not full.
-        unknowns, held
-            Unknown displacements, and displacements that grid boundary conditions fix.
+        cut: the cut particle domains; mass (n,), kg: masses of the points; fill (cells,): volume fraction of the local
+        cells; facets: faces between two active cells, at least one not full; unknowns, held: unknown displacements, and
+        displacements that grid boundary conditions fix.
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])

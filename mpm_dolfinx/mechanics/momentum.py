@@ -393,24 +393,10 @@ class MomentumSystem:
 class MomentumProblem:
     """Balance of momentum of one step.
 
-    Parameters
-    ----------
-    forms
-        Compiled forms.
-    system
-        Vectors and matrices, with assembled penalties.
-    data
-        Integration points.
-    loads
-        Loads on the bodies.
-    tolerance
-        Tolerance of the residual, relative to the forces.
-    goes_on : (unknowns,)
-        Displacements extrapolated from the last step, m, a local array; None if unknown.
-    held : (unknowns,)
-        Forces that balance the initial stress where loads do not, N, a local array, or None.
-    yielded
-        Whether any soil has yielded before this step.
+    forms: compiled forms; system: vectors and matrices, with assembled penalties; data: integration points; loads: on
+    the bodies; tolerance: of the residual, relative to the forces; goes_on (unknowns,): displacements extrapolated from
+    the last step, m, a local array, None if unknown; held (unknowns,): forces that balance the initial stress where
+    loads do not, N, a local array, or None; yielded: whether any soil has yielded before this step.
     """
 
     def __init__(

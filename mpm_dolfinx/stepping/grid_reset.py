@@ -584,18 +584,8 @@ class Assembled(Keyed):
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 
-        Parameters
-        ----------
-        state
-            State at the start of the step.
-        weight : (d,), N/m^3
-            Unit weight of the fluid, with gravity.
-        data
-            Integration points.
-        t
-            Time of the pressures and fluxes on open sides, s.
-        dt
-            Length of the step, s.
+        state: at the start of the step; weight (d,), N/m^3: unit weight of the fluid, with gravity; data: integration
+        points; t: time of the pressures and fluxes on open sides, s; dt: length of the step, s.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents

@@ -133,9 +133,9 @@ def begin_stage(
     state = scene.followed(state)
     if state.stays:  # points have the pressures of their cells, not of their pieces
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
-    rests, supported = not state.begins or state.held is not None, _holds_as(after, before)
-    state = replace(state, stay=None)
-    if after.inertia and not before.inertia and rests and supported and not scene.momentum.own.rates:
+    rests = after.inertia and not before.inertia and (not state.begins or state.held is not None)
+    state, supported = replace(state, stay=None), _holds_as(after, before)
+    if rests and supported and not scene.momentum.own.rates:
         state = _kept_at_rest(scene, state)
     else:
         state = replace(state, held=None)
@@ -213,16 +213,19 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
     """Return the state on the grid of the next step, with the forces `State.held` that keep it at rest there.
 
     Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
+    There are no such forces with contact, which pushes the penetrations out that the last step has left.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
-    state, unknowns, gravity = start.state, start.matrices.momentum.unknowns, start.acting[-1].gravity
+    state, system = start.state, start.matrices.momentum
+    if any(one.touches for one in start.acting[-1].loads):
+        return replace(state, held=None)
     where = start.on_grid.cut, start.on_grid.fill, state.points, start.data
     place = Place(*where, state.t, TINY, state.t, state.outcome, inertia=True)  # dt = 0: no prescribed displacements
     (loads,) = at_rest(scene, state, [state.stage.placed(place)])
-    when = When(state.t, FOREVER, gravity, FOREVER, 0.0)
-    residual, _ = scene.balance(when, start.matrices.momentum, start.data, loads, 0.0).assemble_residual()
+    when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
+    residual, _ = scene.balance(when, system, start.data, loads, 0.0).assemble_residual()
     forms.u.x.array[:] = 0.0
-    unknowns.add(forms.u, 1.0, residual)
+    system.unknowns.add(forms.u, 1.0, residual)
     return replace(state, held=forms.u.x.array.copy())
 
 
