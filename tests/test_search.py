@@ -162,6 +162,19 @@ def test_steps_to_where_forces_do_no_work_save_newton_steps(monkeypatch):
     assert searched < 0.8 * full and searched < 110
 
 
+def test_the_tangent_has_the_fluxes_derivative_by_displacements_only_where_the_storage_is_farther_out(monkeypatch):
+    taken, direction = [], newton.Newton._direction
+
+    def noted(self: newton.Newton, errors: newton.Errors, slow: bool) -> int:
+        taken.append((slow, errors.p.max() > errors.u.max()))
+        return direction(self, errors, slow)
+
+    monkeypatch.setattr(newton.Newton, "_direction", noted)
+    s = pushed()
+    assert sum(s.step(2.0).newton for _ in range(3)) == len(taken)
+    assert (True, True) in taken and (True, False) not in taken
+
+
 def test_firmer_tangents_save_newton_steps_where_soil_yields_for_the_first_time(monkeypatch):
     # single steps differ by a factor of two with the last digits of the linear solvers (38 or 67), sums do not
     steps = (2.0, 2.5, 3.0, 3.5, 4.0, 5.0)

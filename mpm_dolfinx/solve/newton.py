@@ -252,9 +252,9 @@ class Newton:
             if self._storage is not None:
                 log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
-            count += 1
-            # a residual is infinite before any fluid has been exchanged
-            lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
+            # the first residual is infinite without exchanged fluid; with yield it shows prescribed displacements alone
+            count, known = count + 1, np.where(before.each > 1, elastic, before.each)
+            lags = (errors.each > keep * known) & (errors.each > tolerance)
             slow = fresh and bool((lags & (errors.p > errors.u)).any())
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle()
@@ -470,8 +470,7 @@ class Newton:
         """Move u and p against the direction; the line search sets the step length of each part; return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        moved = np.zeros(of.count)
-        steps = moved + 1.0
+        moved, steps = np.zeros(of.count), np.ones(of.count)
         first = np.empty(0) if elastic else self._work()  # without yield it is not used
         if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)

@@ -156,8 +156,8 @@ class State:
     trend
         Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after bodies were added.
     held : (unknowns,), N
-        Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
-        forces, after a new stage, and after a reset of the grid.
+        Nodal forces on this process, with ghosts, that balance an initial stress where loads do not, or a body at rest
+        when inertia begins. None without such forces, after other new stages, and after a reset of the grid.
     rest : (unknowns,), m
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.
